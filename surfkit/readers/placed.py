@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from surfkit.readers.capture import Capture
 from surfkit.scene.crs import known_axes
 
 FILE = "georeference.json"
+CODE = re.compile(r"EPSG:\d{4,6}", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -23,11 +25,13 @@ class Placed:
         crs: Coordinate reference system, such as "EPSG:32633".
         offset: East, north and up, units of the map.
         metres_per_unit: Of the map; None is what its system says.
+        vertical_crs: What heights are above, such as "EPSG:5773" (EGM96), where `crs` does not say it.
     """
 
     crs: str
     offset: tuple[float, float, float]
     metres_per_unit: float | None = None
+    vertical_crs: str | None = None
 
     def __post_init__(self) -> None:
         if (
@@ -36,6 +40,16 @@ class Placed:
             or not (self.metres_per_unit is None or 0 < self.metres_per_unit < np.inf)
         ):
             raise BadInput("crs must name a system, offset and metres_per_unit must be finite numbers")
+        if self.vertical_crs is not None and not (CODE.fullmatch(self.crs) and CODE.fullmatch(self.vertical_crs)):
+            raise BadInput(
+                f"vertical_crs is {self.vertical_crs!r} and crs {self.crs!r}; with a vertical_crs, both must be codes "
+                "such as EPSG:5773 and EPSG:32633"
+            )
+
+    @property
+    def system(self) -> str:
+        """The coordinate reference system with what heights are above, such as "EPSG:32633+5773"."""
+        return self.crs if self.vertical_crs is None else f"{self.crs}+{self.vertical_crs.partition(':')[2]}"
 
 
 def read_placed(*folders: Path) -> Placed | None:
@@ -54,7 +68,7 @@ def read_placed(*folders: Path) -> Placed | None:
 def on_the_map(capture: Capture, placed: Placed) -> Capture:
     """A capture in the coordinates of the map."""
     offset, metres = np.array(placed.offset), placed.metres_per_unit
-    if metres is None and (axes := known_axes(placed.crs)) is not None:
+    if metres is None and (axes := known_axes(placed.system)) is not None:
         metres = axes.metres
     shots = []
     for shot in capture.shots:
@@ -66,6 +80,6 @@ def on_the_map(capture: Capture, placed: Placed) -> Capture:
         shots=shots,
         xyz=capture.xyz + offset,
         metres=metres,
-        crs=placed.crs,
+        crs=placed.system,
         shift=placed.offset if any(placed.offset) else capture.shift,
     )

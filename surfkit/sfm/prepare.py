@@ -15,6 +15,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.stages import Stages, key_of
 from surfkit.readers.georeference import Similarity
 from surfkit.readers.placed import Placed
+from surfkit.scene.crs import EGM96
 from surfkit.sfm.adjust import adjust_once
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
@@ -80,7 +81,7 @@ class Preparation:
             raise BadInput(self._no_model(photos, reasons(photos, found.counts, matches, [])))
         placed = stages.run("georeference", "", lambda: self._place(models, positions, site))
         by_name = {photo.name: photo for photo in usable}
-        done = [(model, None if where is None else _placed(where)) for model, where, _ in placed]
+        done = [(model, None if where is None else _placed(where, self.settings.crs)) for model, where, _ in placed]
         stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources))
         names = [set(centres_of(model)) for model, _, _ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
@@ -277,8 +278,12 @@ def _sim3d(given: Similarity) -> Any:
     return engine.Sim3d(given.scale, engine.Rotation3d(given.turn), given.move)
 
 
-def _placed(where: Placement | Control) -> Placed:
-    return Placed(where.chart.crs, where.chart.offset, where.chart.metres)
+def _placed(where: Placement | Control, given: str) -> Placed:
+    """For the file beside a model; other programs know `crs` better without a vertical part that nobody has given."""
+    crs, heights = where.chart.crs, None
+    if given == "auto" and crs.endswith(EGM96):
+        crs, heights = crs.removesuffix(EGM96), f"EPSG:{EGM96.removeprefix('+')}"
+    return Placed(crs, where.chart.offset, where.chart.metres, heights)
 
 
 def _levelled(model: Any, photos: dict[str, Photo]) -> Any:

@@ -193,6 +193,18 @@ def test_a_colmap_model_is_on_the_map_by_a_file_beside_it_or_above(tmp_path, pla
     np.testing.assert_allclose(observations(Data(tmp_path), scene).xyz, local, atol=1e-6)
 
 
+def test_heights_of_a_file_beside_a_model_may_have_a_system_of_their_own(tmp_path):
+    write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
+    file = tmp_path / "georeference.json"
+    file.write_text(json.dumps(PLACED | {"vertical_crs": "EPSG:7837"}))
+    frame = read(Data(tmp_path)).frame
+    assert (frame.crs, frame.metres) == ("EPSG:25832+7837", 1.0)
+    for wrong in ({"vertical_crs": "sea level"}, {"vertical_crs": "EPSG:7837", "crs": "EPSG:25832+5773"}):
+        file.write_text(json.dumps(PLACED | wrong))
+        with pytest.raises(BadInput, match="vertical_crs is .* codes such as EPSG:5773"):
+            read(Data(tmp_path))
+
+
 def test_two_files_that_put_a_colmap_model_in_two_places_are_refused(tmp_path):
     write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
     for place in (".", "sparse/0"):

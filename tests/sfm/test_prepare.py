@@ -72,6 +72,8 @@ def test_cameras_are_found_and_placed(prepared):
     assert shape.max() < 0.1, "of cameras 20 m away"
     assert np.linalg.norm(ours - truth, axis=1).max() < 0.3
     assert scene.frame.crs == "EPSG:32633+5773", "above sea level, as EXIF says"
+    beside = json.loads((prepared / "sparse/0/georeference.json").read_text())
+    assert (beside["crs"], beside["vertical_crs"]) == ("EPSG:32633", "EPSG:5773"), "for programs that know no other"
     assert scene.frame.metres == 1
     assert scene.frame.shift == (512_000, 5_800_000, 0)
     focal = {view.camera.fx / view.camera.width for view in scene.train}
