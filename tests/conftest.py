@@ -230,8 +230,16 @@ def crowd():
 
 
 @pytest.fixture(scope="module")
-def small_pictures():
-    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter to some tests."""
+def quick_alignment():
+    """ICP, which is most of a comparison and no matter to some tests, ends after two fits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surfkit.evaluate.geometry.registration.ITERATIONS", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_comparison(quick_alignment):
+    """What is drawn of errors, most of the rest of a comparison, is a quarter as wide too."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("errors", "measure", "class_pictures"):
             patch.setattr(f"surfkit.evaluate.geometry.{module}.LONGEST_PX", 180)
