@@ -222,6 +222,16 @@ def forked_probe(monkeypatch):
 
 
 @pytest.fixture
+def forked_jobs():
+    """The processes of `Pool` are forked from one that has loaded torch."""
+    from forks import Forked
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surfkit.execute.base.subprocess", types.SimpleNamespace(Popen=Forked, DEVNULL=None))
+        yield
+
+
+@pytest.fixture
 def crowd():
     """200 random points and a step about them, at which policies with default settings act."""
     from surfkit.testing import inputs
