@@ -222,6 +222,16 @@ def forked_probe(monkeypatch):
 
 
 @pytest.fixture
+def forked_jobs():
+    """The processes of `Pool` are forked from one that has loaded torch."""
+    from forks import Forked
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surfkit.execute.base.subprocess", types.SimpleNamespace(Popen=Forked, DEVNULL=None))
+        yield
+
+
+@pytest.fixture
 def crowd():
     """200 random points and a step about them, at which policies with default settings act."""
     from surfkit.testing import inputs
@@ -230,8 +240,16 @@ def crowd():
 
 
 @pytest.fixture(scope="module")
-def small_pictures():
-    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter to some tests."""
+def quick_alignment():
+    """ICP, which is most of a comparison and no matter to some tests, ends after two fits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("surfkit.evaluate.geometry.registration.ITERATIONS", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_comparison(quick_alignment):
+    """What is drawn of errors, most of the rest of a comparison, is a quarter as wide too."""
     with pytest.MonkeyPatch.context() as patch:
         for module in ("errors", "measure", "class_pictures"):
             patch.setattr(f"surfkit.evaluate.geometry.{module}.LONGEST_PX", 180)

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import runpy
 import sys
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
@@ -29,16 +30,58 @@ def started(
 
 
 def _command(words: list[str], log: Path, given: dict[str, str], before: Callable[[], object] | None) -> None:
-    import torch
-
     from surfkit.cli import main
 
-    torch.set_num_threads(1)
+    _prepare(given, log, 1)
+    if before is not None:
+        before()
+    sys.exit(main(words))
+
+
+class Forked:
+    """What `Pool` asks of `subprocess.Popen`, of a process of Python; that it is forked from is its driver."""
+
+    def __init__(self, words, env, stdin, stdout, stderr, start_new_session):
+        assert stdout is stderr and start_new_session
+        self.process = CONTEXT.Process(target=_python, args=(words[1:], env, stdout.name))
+        self.process.start()
+
+    @property
+    def returncode(self):
+        return self.process.exitcode
+
+    def poll(self):
+        return self.process.exitcode
+
+    def terminate(self):
+        self.process.terminate()
+
+    def wait(self):
+        self.process.join()
+        return self.process.exitcode
+
+
+def _python(words: list[str], given: dict[str, str], log: Path) -> None:
+    """`python -c CODE` or `python -m MODULE`, with what follows."""
+    from surfkit.execute.remote import DRIVER
+
+    os.setsid()
+    _prepare(given | {DRIVER: str(os.getppid())}, log, int(given["OMP_NUM_THREADS"]))
+    how, what, *rest = words
+    sys.argv = [what, *rest]
+    if how == "-c":
+        exec(what, {"__name__": "__main__"})
+    else:
+        runpy.run_module(what, run_name="__main__", alter_sys=True)
+
+
+def _prepare(given: dict[str, str], log: Path, threads: int) -> None:
+    """This process gets an environment, threads, and a file for what it prints."""
+    import torch
+
+    torch.set_num_threads(threads)
     os.environ.clear()
     os.environ.update(given)
     with open(log, "ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    if before is not None:
-        before()
-    sys.exit(main(words))

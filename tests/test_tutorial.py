@@ -92,12 +92,13 @@ def change(path, text):
 
 
 def give_all(python, lines, folder):
-    """What each command prints; those of surfkit that follow one another share a process, and have fewer steps."""
+    """What each command prints; those of surfkit that follow one another share a process, and take less."""
     shown = {}
     for is_surfkit, group in groupby(lines, lambda line: line.startswith("surfkit ")):
         group = list(group)
         if is_surfkit:
-            words = [shlex.split(line.replace("--steps 60", "--steps 12"))[1:] for line in group]
+            less = [line.replace("--steps 60", "--steps 6").replace("--scale 8", "--scale 16") for line in group]
+            words = [shlex.split(line)[1:] for line in less]
             printed = give(python, ["-c", COMMANDS, json.dumps(words)], folder).split("\0\n")
         else:
             printed = [give(python, command(shlex.split(line)), folder) for line in group]

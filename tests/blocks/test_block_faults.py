@@ -170,6 +170,7 @@ def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, 
     assert (state.status, state.fallback) == ("done", NO_GROWTH), "the same command goes on from the rung"
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Real processes with a real limit: 10 MB for each point, and 3 GB more than the program has."""
     command, out = schedule.job_of, without_block_0(undisturbed, tmp_path / "run")
@@ -203,6 +204,7 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
     assert "are lowered from" not in log, "on its rung there is no cache to lower"
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, recipe, tmp_path, monkeypatch):
     """SIGKILL, and the system counts one more; the first rung leaves the result as it is."""
     command, kills, out = schedule.job_of, iter([7, 8, 8]), without_block_0(undisturbed, tmp_path / "run")

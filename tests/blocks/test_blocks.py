@@ -69,6 +69,7 @@ def test_a_pool_comes_to_the_same_bits(undisturbed, data, recipe, tmp_path):
     assert again["points"] == len(params(undisturbed)["means"])
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Ctrl-C between two steps of the second block; then another executor finishes."""
     train_block = schedule.train_block
@@ -92,6 +93,7 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
     assert same(tmp_path, undisturbed)
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_path, capsys):
     """The first process of block 0 kills itself in the middle of its steps; the next one goes on."""
     command = schedule.job_of
@@ -147,6 +149,7 @@ def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
         run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_path):
     """Its workers notice, save and leave; the same command finishes to the same bits."""
     recipe_file = undisturbed / "recipe.json"

@@ -111,6 +111,7 @@ def test_the_plan_tells_the_borders(runs):
     assert int((means @ x < border).sum()) == gave[0]["kept"] and int((means @ x >= border).sum()) == gave[1]["kept"]
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):
     run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert same(tmp_path, runs["tuned"])
@@ -136,6 +137,7 @@ def killed_in_block_1(monkeypatch):
     monkeypatch.setattr(schedule, "job_of", deadly)
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):
     """In a pool; what was made in this process, undisturbed, has the same bits, those of the frozen points too."""
     killed_in_block_1(monkeypatch)

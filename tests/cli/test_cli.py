@@ -337,10 +337,10 @@ def ended(words, shell):
 @pytest.mark.parametrize(
     ("words", "shell", "status", "said"),
     [
-        (["recipes"], ">&-", 0, ""),
+        (["--help"], ">&-", 0, ""),
         (["train", "--help"], ">&- <&- 2>&-", 0, ""),
         (["trian"], ">&-", 2, "surfkit: no command 'trian'"),
-        (["recipes"], ">/dev/full", 1, "surfkit: standard output: No space left on device"),
+        (["--help"], ">/dev/full", 1, "surfkit: standard output: No space left on device"),
         (["--help"], "1</dev/null", 1, "surfkit: standard output: Bad file descriptor"),
         (["train", "--help"], "| true; exit ${PIPESTATUS[0]}", 141, ""),
         (["trian"], "2>&1 >/dev/null | true; exit ${PIPESTATUS[0]}", 141, ""),

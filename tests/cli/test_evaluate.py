@@ -20,7 +20,7 @@ from surfkit.readers.data import Data
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")
-pytestmark = pytest.mark.usefixtures("small_pictures")
+pytestmark = pytest.mark.usefixtures("quick_comparison")
 
 
 @pytest.fixture(scope="module")

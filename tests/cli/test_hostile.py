@@ -18,7 +18,7 @@ RUN = "--steps 2 --device cpu --pictures-every 1 --primitive.sh-degree 1 --cache
 SWEEP = "prepare depth {m}/data estimator:plane-sweep"
 CUT = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 SHAPES = ("null", "[1]", "7", '"x"', "{}", "[" * 100_000 + "]" * 100_000, '{"a":' * 500 + "1" + "}" * 500)
-pytestmark = pytest.mark.usefixtures("small_pictures")
+pytestmark = pytest.mark.usefixtures("quick_comparison")
 
 
 @pytest.fixture(scope="module")

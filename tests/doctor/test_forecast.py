@@ -276,7 +276,7 @@ def test_what_it_means_that_a_probe_ended_early(farm, monkeypatch, taken, failur
     assert found is None and finding.level == level and finding.text.startswith(words)
 
 
-def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path):
+def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path, forked_probe):
     """Of the disk; memory and time depend on what else the machine does, and are looked at in bench/doctor.py."""
     farm = Path(shutil.copytree(farm, tmp_path / "farm", ignore=shutil.ignore_patterns("undistorted")))
     data, out = Data(farm, test_every=4), tmp_path / "run"

@@ -96,9 +96,10 @@ def test_noise_does_not_shrink():
 
 
 def test_a_loss_by_alignment_is_told(told):
-    outcome = compare(cloud(town(7)), cloud(town(0)), Comparison(crop="none", tau=TAU, draws=1))
+    ours, truth = town(7, count=1_000), town(0, count=1_000)
+    outcome = compare(cloud(ours), cloud(truth), Comparison(crop="none", tau=4 * TAU, draws=1))
     before = outcome.others["none"]
     worse = comparison.replace(before, distances=comparison.replace(before.distances, to_truth=np.full(99, 9.0)))
     assert not told
-    warn_of_loss(worse, before, "similarity", TAU)
+    warn_of_loss(worse, before, "similarity", 4 * TAU)
     assert len(told) == 1 and "--align similarity lowers F1 from 0.9" in told[0] and "to 0.000" in told[0]

@@ -28,6 +28,7 @@ from surfkit.testing.synthetic import Flight, photograph
 from .test_crop_volume import exact_visible, overhead, synthetic_points
 
 trimesh = needs("trimesh")
+pytestmark = pytest.mark.usefixtures("quick_alignment")
 
 TAU = 0.5
 HOUSES = [((-12, -10), (-4, -3), 5.0), ((3, -8), (9, 6), 8.0), ((-10, 4), (-5, 12), 3.0)]

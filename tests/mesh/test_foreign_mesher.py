@@ -40,7 +40,7 @@ def sheet(side=20):
     return vertices, faces.reshape(-1, 3).astype(np.int32)
 
 
-pytestmark = pytest.mark.usefixtures("small_pictures")
+pytestmark = pytest.mark.usefixtures("quick_comparison")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def test_every_command_that_follows(finished, tmp_path, capsys):
         ["mesh", str(folder / "run")],
         ["mesh", str(folder / "run"), "--mesh.case", "none"],
         ["mesh", str(folder / "run"), "mesh:bare", "--formats", "ply", "obj"],
-        ["evaluate", str(folder / "run"), "--gt", str(folder / "run/mesh.ply"), "--tau", "0.1"] + ["--draws", "1"],
+        ["evaluate", str(folder / "run"), "--gt", str(folder / "run/mesh.ply"), "--tau", "0.3"] + ["--draws", "1"],
     ):
         assert main(command) == 0, command
     assert json.loads((folder / "run/mesh.json").read_text())["facts"] == {}
@@ -175,6 +175,6 @@ def test_a_row_of_an_ablation(finished, tmp_path, monkeypatch, capsys):
     rows = (Row("odd facts", {"mesh": Plane()}),)
     monkeypatch.setitem(TABLES, "meshers", Table("meshers", "Meshers of a stranger.", base, rows))
     data = ["--data", str(folder / "data"), "--steps", "10", "--out", str(tmp_path / "ablation"), "--probe", "0"]
-    assert main(["ablate", "table:meshers", *data, "--gt", str(folder / "run/mesh.ply"), "--tau", "0.1"]) == 0
+    assert main(["ablate", "table:meshers", *data, "--gt", str(folder / "run/mesh.ply"), "--tau", "0.3"]) == 0
     shown = capsys.readouterr().out
     assert "odd facts" in shown and "F1" in shown

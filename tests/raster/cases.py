@@ -1,12 +1,13 @@
 """Scenes with what the reference makes of them in float64, and how far a rasterizer may be from that."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import Gradients, Maps, Render, Splats
+from surfkit.raster.api import STANDARD, Gradients, Maps, Render, Splats
 from surfkit.raster.reference import Reference, draw
 from surfkit.scene.camera import Camera
 
@@ -38,6 +39,19 @@ def case(name: str, kind: str, degree: int | None = None) -> Case:
     maps = true.maps.present()
     cotangents = {key: (draws.normal(*value.shape) * clear).float() for key, value in maps.items()}
     return Case(shown, view, clear, true, cotangents)
+
+
+@cache
+def true_gradients(name: str, kind: str) -> dict[str, Gradients]:
+    """What the reference gives for the cotangent of each map alone."""
+    c = case(name, kind)
+    return {key: c.true.backward(Maps(**{key: value})) for key, value in c.cotangents.items()}
+
+
+def added(parts: Iterable[Gradients]) -> Gradients:
+    """The gradients for several cotangents at once, as they are linear in these."""
+    parts = list(parts)
+    return Gradients(**{name: sum(getattr(part, name) for part in parts) for name in (*STANDARD, "signal")})
 
 
 def different_maps(found: Maps, true: Maps, clear: Tensor) -> dict[str, float]:

@@ -16,7 +16,7 @@ from surfkit.report.study import Plan, ablate, report_so_far
 from surfkit.report.truth import Truth
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
-pytestmark = pytest.mark.usefixtures("small_pictures")
+pytestmark = pytest.mark.usefixtures("quick_comparison")
 
 
 class Silent:

@@ -9,7 +9,7 @@ from surfkit.recipes.ablations import TABLES
 from surfkit.report.study import Plan, ablate
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
-pytestmark = pytest.mark.usefixtures("small_pictures")
+pytestmark = pytest.mark.usefixtures("quick_comparison")
 
 
 class Silent:

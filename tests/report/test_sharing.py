@@ -130,6 +130,7 @@ def test_without_sharing_each_row_computes_all(whole, table, data, tmp_path):
     assert found and all(wanted[name] == value for name, value in found.items())
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_pool_gives_the_same_and_computes_shared_stages_once(whole, table, data, tmp_path):
     watch = Silent()
     report = ablate(Plan(table, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), watch)
@@ -216,6 +217,7 @@ def test_what_becomes_of_a_process_that_dies(table, data, tmp_path):
     assert outcome_of(work, JobResult(job, 0)) == Outcome({"psnr": 1.5, "points": 7}, "no mesh")
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_row_that_fails_in_a_pool_does_not_stop_the_others(table, data, tmp_path):
     broken = replace(table, rows=(Row("bad", {"start": SURFACE.start}, kept=False), table.rows[0]))
     report = ablate(Plan(broken, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), Silent())

@@ -104,7 +104,7 @@ def test_evaluate_mesh_and_export_read_it(copy, tmp_path, capsys):
     assert "no mesh.ply in it" in capsys.readouterr().err
 
 
-def test_a_mesh_of_it_lies_in_its_folder_and_is_measured(data, recipe, tmp_path):
+def test_a_mesh_of_it_lies_in_its_folder_and_is_measured(data, recipe, tmp_path, quick_comparison):
     out = tmp_path / "run"
     run(replace(recipe, mesh=TSDF(least_views=1)), data, out, Compute("cpu"))
     words = ["--mesh.least-views", "1", "--clusters", "1", "--least-triangles", "1"]

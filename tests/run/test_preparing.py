@@ -392,7 +392,7 @@ def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
     words = ["train", f"recipe:{tmp_path / 'recipe.json'}", "--data", str(farm.path), "--pictures-every", "0", "--out"]
     both = [started([*words, str(tmp_path / name)], tmp_path / f"{name}.log") for name in "ab"]
     for process in both:
-        process.join(200)
+        process.join()
     told = [(tmp_path / f"{name}.log").read_text() for name in "ab"]
     assert [process.exitcode for process in both] == [0, 0], told
     assert len(list((own_cache / "depth").iterdir())) == 1
@@ -401,6 +401,7 @@ def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
     assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_blocks_in_processes_of_their_own_find_the_maps(farm, recipe, tmp_path, own_cache, monkeypatch, capsys):
     tune = replace(recipe.pretrain, steps=6, sh_every=1)
     recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
