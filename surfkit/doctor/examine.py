@@ -215,7 +215,8 @@ def _split(gathered: Gathered) -> list[Finding]:
     found = []
     if shots and train < 3:
         text = f"{train} photographs to train on: a surface needs at least 3, and should have dozens"
-        found.append(Finding("warning", "few-photographs", f"{text}; align more, or use --test-every 0"))
+        remedy = "align more, or use --test-every 0" if train < shots else "align more"
+        found.append(Finding("warning", "few-photographs", f"{text}; {remedy}"))
     if shots and train == shots:
         text = "no photograph is kept from training, so the quality cannot be measured; see --test-every"
         found.append(Finding("note", "no-held-out", text))
@@ -302,7 +303,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     if not shots:
         return ()
     train, held = len(gathered.train), len(shots) - len(gathered.train)
-    whose = "its own split" if gathered.capture.held_out is not None else f"every {data.test_every}th"
+    whose = "its own split" if gathered.capture.held_out is not None else f"one of every {data.test_every}"
     whose = "as listed" if data.test_list is not None else whose
     whose = name_of(data.split) if data.split is not None else whose
     told = [f"train on {train} photographs, and measure on {held}" + (f" ({whose})" if held else "")]

@@ -35,6 +35,8 @@ MOST_VIEWS = 64
 """Places of photographs that the page knows, evenly spaced."""
 LOOKED_AT = 20_000
 """Splats by which it is found how far ahead of a camera the scene lies."""
+STEEP = 0.9
+"""Sine of the elevation from which on a view looks up: at the sky, or a ceiling."""
 CELLS = 16
 """Parts of each side of a picture, by which it is found how much of it is filled."""
 FOCAL = 1.0
@@ -98,7 +100,7 @@ class Page(Format):
             "unit": unit,
             "discs": kept.kind == "surfel",
             "up": up.tolist(),
-            "start": max(range(len(seen)), key=lambda at: seen[at]["shown"], default=0),
+            "start": max(range(len(seen)), key=lambda at: _fit_to_begin(seen[at], up), default=0),
             "views": seen or [_overview(up)],
         }
         with replacing(path) as file:
@@ -140,6 +142,11 @@ def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, her
     shape = {"focal": camera.fy / camera.height, "aspect": camera.width / camera.height}
     place = {"eye": eye.tolist(), "turn": turn.ravel().tolist(), "away": away}
     return {"name": view.name, **place, **shape, "shown": filled * float(inside.mean()) if len(few) else 0.0}
+
+
+def _fit_to_begin(place: dict[str, Any], up: np.ndarray) -> tuple[bool, float]:
+    """The higher, the better a page begins there: first of all, it does not look up, as one view of a panorama does."""
+    return bool(np.reshape(place["turn"], (3, 3))[2] @ up < STEEP), place["shown"]
 
 
 def _overview(up: np.ndarray) -> dict[str, Any]:

@@ -161,8 +161,8 @@ class TSDF(Mesher):
         left_out = {"oversized_splats": given - len(subject.splats)} if self.largest_px else {}
         if not len(faces):
             raise BadInput(
-                f"no surface: with {describe_lengths(lengths, subject)}, no voxel beside one was seen by "
-                f"{self.least_views:g} views; lower --mesh.least-views, or train for more steps"
+                f"no surface: with {describe_lengths(lengths, subject)}, no two voxels side by side have the weight of "
+                f"--mesh.least-views {self.least_views:g}; lower it, or train for more steps"
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | counts | left_out)
 

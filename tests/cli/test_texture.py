@@ -49,6 +49,13 @@ def test_a_run_gets_a_textured_mesh(run, capsys):
     assert names == ["texture.json", "textured.glb"], "no file of before beside new ones"
 
 
+def test_a_file_is_no_folder(run, tmp_path, capsys):
+    assert main(["texture", str(run), "--out", str(tmp_path / "mine.GLB")]) == 2
+    assert capsys.readouterr().err.endswith("mine.GLB: give a folder, and --formats glb\n") and not any(
+        tmp_path.iterdir()
+    )
+
+
 @needs_native
 def test_a_texture_goes_on_after_the_process_was_killed(run, tmp_path):
     words = ["texture", str(run), "--size", "128", "--out"]

@@ -252,7 +252,7 @@ def test_a_sound_data_set_is_sound_and_is_not_touched(made):
         "1,500, each in view of"
     )
     assert examined.diagnosis.will == (
-        "train on 14 photographs, and measure on 2 (every 8th)",
+        "train on 14 photographs, and measure on 2 (one of every 8)",
         "start from about 1,500 points (start:sparse)",
     )
 

@@ -179,6 +179,15 @@ def test_it_does_not_begin_at_the_rim(tmp_path):
     Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, None)
     facts = facts_of(tmp_path / "a.html")
     assert facts["views"][facts["start"]]["name"] == "middle"
+    back = np.array([0.0, 0.0, 1.0])  # the middle looks up then
+    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
+    assert facts_of(tmp_path / "a.html")["start"] == 1, "both look the same way"
+    level = views[0].camera.world_to_camera.clone()
+    level[:3, :3] = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    level[:3, 3] = torch.tensor([0.0, 0.0, 3.0])
+    views = [views[1], replace(views[0], camera=replace(views[0].camera, world_to_camera=level))]
+    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
+    assert facts_of(tmp_path / "a.html")["start"] == 1, "not at the ceiling"
 
 
 def test_of_many_splats_those_are_kept_of_which_most_is_seen(tmp_path):
