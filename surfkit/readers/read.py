@@ -29,6 +29,7 @@ from surfkit.readers.panoramas import (
     cut,
     cut_tracks,
     parts_of,
+    points_remedy,
     size_to_read,
     view_names,
     view_sizes,
@@ -133,7 +134,7 @@ def build_scene(
         name=data.path.resolve().name,
         train=tuple(view for shot, view in views if shot not in held_out),
         held_out=tuple(view for shot, view in views if shot in held_out),
-        cloud=_cloud(capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
+        cloud=_cloud(data.path, capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
         frame=frame,
     )
     for line in decided.lines:
@@ -369,15 +370,15 @@ def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
     return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
 
 
-def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
+def _cloud(path: Path, capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
     if len(capture.xyz):
         xyz = frame.to_local(capture.xyz).astype(np.float32)
         return Cloud(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
     emit(
         Warned(
             f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
-            "cameras and of what lies before them, which takes longer and leaves more floaters; `surfkit prepare "
-            "points` makes a data set with points"
+            "cameras and of what lies before them, which takes longer and leaves more floaters; "
+            f"{points_remedy(path, view_names(capture.shots))}"
         )
     )
     local = np.stack([frame.local_pose(pose).numpy() for pose in poses])
