@@ -6,6 +6,7 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from surfkit.core.check import BadInput, few
+from surfkit.core.events import reading_again
 from surfkit.core.registry import name_of
 from surfkit.depth.prepare import REMEDY, others_warning
 from surfkit.doctor.finding import Finding, from_errors
@@ -64,7 +65,8 @@ def _has_tracks(data: Data, gathered: Gathered) -> bool:
     """Whether any photograph is known to observe a sparse point, without which none can be compared."""
     if gathered.capture.groups:
         return True
-    tracks = reader_of(data).tracks(data)
+    with reading_again():
+        tracks = reader_of(data).tracks(data)
     return tracks is not None and any(len(rows) for rows, _ in tracks.seen.values())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput, reject
-from surfkit.core.events import Warned, emit
+from surfkit.core.events import Warned, emit, reading_again
 from surfkit.core.registry import components, find, name_of
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot
@@ -246,7 +246,8 @@ def observations(data: Data, scene: Scene) -> Observations:
         scene: That `read` gave for it.
     """
     reader = reader_of(data)
-    tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
+    with reading_again():  # most layouts have cameras and tracks in the same files
+        tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
     if tracks is None:
         return Observations(np.zeros((0, 3)), np.zeros(0), {})
     tracks = cut_tracks(tracks)

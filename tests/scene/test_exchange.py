@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput, collecting
+from surfkit.doctor.gather import heard
 from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import observations, read, read_capture, reader_of
@@ -395,6 +396,16 @@ def test_sparse_points_of_opf_of_another_calibration(tmp_path, own, said):
         read(Data(tmp_path))
     lines = [text for text in kept.texts if "observations" in text]
     assert len(lines) == (said is not None) and all(f"calibrated.json: {said}" in text for text in lines)
+
+
+def test_what_an_opf_lacks_is_told_once(tmp_path):
+    """Its tracks are read anew, by each part of a run that needs them."""
+    opf(tmp_path)
+    data = Data(tmp_path)
+    with heard() as texts:
+        scene = read(data)
+        assert len(observations(data, scene).seen) == len(observations(data, scene).seen) == len(POSES)
+    assert sum("1 of 5 photographs are left out" in text for text in texts) == 1
 
 
 def test_opf_without_sparse_points_of_its_own(tmp_path):
