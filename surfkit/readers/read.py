@@ -37,6 +37,7 @@ from surfkit.readers.panoramas import (
 )
 from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
+from surfkit.readers.record3d import PACKED
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import (
     Picture,
@@ -193,6 +194,9 @@ def reader_of(data: Data) -> Reader:
     root = data.path
     if is_video(root):
         raise BadInput(f"{root}: a video; {_finds_cameras(root)}")
+    if root.suffix.lower() == PACKED and root.is_file():
+        command = f"unzip {shlex.quote(str(root))} -d {shlex.quote(str(root.with_suffix('')))}"
+        raise BadInput(f"{root}: a packed scan of Record3D; `{command}` unpacks it; give the folder that this makes")
     if not root.is_dir():
         raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
     if not any(root.iterdir()):
@@ -204,6 +208,9 @@ def reader_of(data: Data) -> Reader:
     first = {name: reader for name, reader in fitting.items() if reader.priority == highest}
     if len(first) > 1:
         raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
+    inner = [] if first else [path for path in sorted(root.iterdir()) if path.is_dir() and _fitting(path)]
+    if inner:
+        raise BadInput(f"{root}: no data set itself, but the folder {inner[0].name!r} in it is one; give {inner[0]}")
     if not first and (photos := bare_photographs(root)):
         raise BadInput(
             f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "

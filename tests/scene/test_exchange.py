@@ -258,6 +258,22 @@ def test_a_packed_file_of_record3d_is_told_to_be_unpacked(tmp_path):
         read(Data(tmp_path))
 
 
+def test_where_a_scan_of_record3d_lies_and_its_photographs_belong(tmp_path):
+    (tmp_path / "my scan").mkdir()
+    record3d(tmp_path / "my scan")
+    (tmp_path / "my scan.r3d").write_bytes(b"PK")
+    with pytest.raises(
+        BadInput, match=r"packed scan of Record3D; `unzip '\S+/my scan.r3d' -d '\S+/my scan'` unpacks it"
+    ):
+        read(Data(tmp_path / "my scan.r3d"))
+    (tmp_path / "my scan.r3d").unlink()
+    with pytest.raises(BadInput, match=r"no data set itself, but the folder 'my scan' in it is one; give \S+/my scan$"):
+        read(Data(tmp_path))
+    (tmp_path / "my scan/rgbd/1.jpg").unlink()
+    with pytest.raises(BadInput, match=r"missing: 'rgbd/1.jpg'; put them into \S+/my scan/rgbd, or name their folder"):
+        read(Data(tmp_path / "my scan"))
+
+
 def test_depth_of_record3d_is_told_and_one_lens_is_one_camera(tmp_path):
     record3d(tmp_path, own=True)
     (tmp_path / "rgbd/1.jpg").unlink()
