@@ -65,8 +65,11 @@ def _has_tracks(data: Data, gathered: Gathered) -> bool:
     """Whether any photograph is known to observe a sparse point, without which none can be compared."""
     if gathered.capture.groups:
         return True
-    with reading_again():
-        tracks = reader_of(data).tracks(data)
+    try:
+        with reading_again():
+            tracks = reader_of(data).tracks(data)
+    except BadInput:
+        return True  # what cannot be read is told already, and may observe some
     return tracks is not None and any(len(rows) for rows, _ in tracks.seen.values())
 
 

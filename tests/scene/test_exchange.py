@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from surfkit.cli import main
 from surfkit.core.check import BadInput, collecting
 from surfkit.doctor.gather import heard
 from surfkit.readers.data import Data
@@ -422,6 +423,12 @@ def test_what_an_opf_lacks_is_told_once(tmp_path):
         scene = read(data)
         assert len(observations(data, scene).seen) == len(observations(data, scene).seen) == len(POSES)
     assert sum("1 of 5 photographs are left out" in text for text in texts) == 1
+
+
+def test_doctor_tells_once_of_points_that_are_cut_off(tmp_path, capsys):
+    opf(tmp_path, change=at("tracks.gltf", "accessors", 0, "count", value=10**12))
+    assert main(["doctor", str(tmp_path), "recipe:surface", "--quick", "--probe", "0"]) == 2
+    assert capsys.readouterr().out.count("position.bin: cut off") == 1
 
 
 def test_opf_without_sparse_points_of_its_own(tmp_path):
