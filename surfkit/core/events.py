@@ -6,7 +6,9 @@ Events are frozen and hold plain values only. Plugins see them through the `surf
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -192,8 +194,23 @@ _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""
 
 
+_AGAIN: ContextVar[bool] = ContextVar("again", default=False)
+
+
+@contextmanager
+def reading_again() -> Iterator[None]:
+    """Within, in this thread, nobody hears warnings: they were told when the same files were read before."""
+    token = _AGAIN.set(True)
+    try:
+        yield
+    finally:
+        _AGAIN.reset(token)
+
+
 def emit(event: Any) -> None:
     """Tell every plugin what happened. One that raises is reported on stderr and not asked again: logs kill no run."""
+    if _AGAIN.get() and isinstance(event, Warned):
+        return
     for impl in plugins().hook.surfkit_event.get_hookimpls():
         key = (impl.plugin_name, id(impl.plugin))
         if key in _silenced:

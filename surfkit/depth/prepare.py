@@ -33,6 +33,7 @@ from surfkit.readers.depth_files import (
 )
 from surfkit.readers.depth_prior import TRUSTED
 from surfkit.readers.fingerprint import content_of, digest
+from surfkit.readers.panoramas import points_remedy
 from surfkit.readers.read import observations
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import view_photo
@@ -108,7 +109,7 @@ class Preparation:
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(
                 f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
-                f"`surfkit prepare points {self.data.path}` makes a data set with such points"
+                f"{points_remedy(self.data.path, (view.name for view in scene.train))}"
             )
 
     def begin(self, scene: Scene, given: DepthInput, again: bool, renew: bool = False) -> tuple[DepthInput, list[int]]:

@@ -26,7 +26,7 @@ from surfkit.doctor.priors import priors
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
 from surfkit.readers.masks import empty_masks
-from surfkit.readers.panoramas import FACES, size_to_read, view_sizes
+from surfkit.readers.panoramas import FACES, points_remedy, size_to_read, view_names, view_sizes
 from surfkit.readers.panoramas import FOLDER as PANORAMAS
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_panorama, is_pinhole
@@ -109,7 +109,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_photographs(data, gathered, looks),
         *_sizes(data, gathered, known),
         *_masks(gathered, known),
-        *_split(gathered),
+        *_split(data, gathered),
         *_groups(gathered),
         *_untied(gathered),
         *_exposure(gathered, known, recipe),
@@ -209,7 +209,7 @@ def _masks(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
     return found
 
 
-def _split(gathered: Gathered) -> list[Finding]:
+def _split(data: Data, gathered: Gathered) -> list[Finding]:
     """What the split leaves."""
     shots, train = len(gathered.capture.shots), len(gathered.train)
     found = []
@@ -223,7 +223,8 @@ def _split(gathered: Gathered) -> list[Finding]:
     wrong = any(finding.level == "error" for finding in gathered.findings)
     if shots and not len(gathered.capture.xyz) and not wrong:
         text = f"there are no sparse points: training would start from {RANDOM_POINTS:,} random ones"
-        found.append(Finding("warning", "no-points", f"{text}; `surfkit prepare points` triangulates some"))
+        remedy = points_remedy(data.path, view_names(gathered.capture.shots))
+        found.append(Finding("warning", "no-points", f"{text}; {remedy}"))
     return found
 
 

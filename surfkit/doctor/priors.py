@@ -6,14 +6,15 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from surfkit.core.check import BadInput, few
+from surfkit.core.events import reading_again
 from surfkit.core.registry import name_of
 from surfkit.depth.prepare import REMEDY, others_warning
 from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.gather import Gathered, depth_maps, heard
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import OFF, alignment, normals_warning, prepare_command
-from surfkit.readers.panoramas import view_names, view_sizes
-from surfkit.readers.read import build_scene
+from surfkit.readers.panoramas import has_panoramas, points_remedy, view_names, view_sizes
+from surfkit.readers.read import build_scene, reader_of
 from surfkit.recipe import Recipe
 from surfkit.train.material import needs_normals, needs_priors
 
@@ -26,11 +27,18 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
     if not train or not (stereo or needs_priors(losses)):
         return []
     normals = needs_normals(losses)
-    make = prepare_command(data)
     try:
         maps = depth_maps(data, gathered)
+        matched = has_panoramas(names) if recipe.depth is None else recipe.depth.matched
+        tracks = bool(maps) or not matched or _has_tracks(data, gathered)
     except BadInput as error:
         return from_errors("depth-priors", [error])
+    make = prepare_command(data) if tracks else points_remedy(data.path, names)
+    if not tracks and recipe.depth is not None:
+        text = "there are no depth priors, and none can be made, as no photograph observes any sparse point"
+        text = f"the run begins at depth maps: {text}" if stereo else f"{text}, so {OFF}"
+        found = Finding("error" if stereo else "warning", "depth-priors", f"{text}; {make}")
+        return [found, *(_normals_to_come(recipe) if normals else [])]
     if not maps and recipe.depth is not None:
         text = f"there are no depth priors, so the run makes them, {len(names)} maps with {name_of(recipe.depth)}"
         return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
@@ -51,6 +59,18 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
     if normals and (text := normals_warning(data, list(maps.values()))):
         found.append(Finding("warning", "prior-normals", text))
     return found if quick else [*found, *_numbers(data, gathered, maps)]
+
+
+def _has_tracks(data: Data, gathered: Gathered) -> bool:
+    """Whether any photograph is known to observe a sparse point, without which none can be compared."""
+    if gathered.capture.groups:
+        return True
+    try:
+        with reading_again():
+            tracks = reader_of(data).tracks(data)
+    except BadInput:
+        return True  # what cannot be read is told already, and may observe some
+    return tracks is not None and any(len(rows) for rows, _ in tracks.seen.values())
 
 
 def _numbers(data: Data, gathered: Gathered, maps: Collection[str]) -> list[Finding]:

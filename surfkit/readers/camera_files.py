@@ -96,8 +96,13 @@ def pose_at(where: str, turn: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return pose
 
 
-def photographs(data: Data, names: Sequence[str]) -> dict[str, Path]:
+def photographs(data: Data, names: Sequence[str], home: str = "images") -> dict[str, Path]:
     """The files of photographs by name: in images/, or beside the cameras, or where --images says.
+
+    Args:
+        data: The data set.
+        names: Of the photographs.
+        home: The folder in it where those that are missing belong.
 
     Raises:
         BadInput: Some are missing, or two have the same name.
@@ -110,9 +115,7 @@ def photographs(data: Data, names: Sequence[str]) -> dict[str, Path]:
         )
     found = find_files(folder, list(dict.fromkeys(names)))
     missing = [name for name in names if name not in found]
-    data.lack(
-        folder, missing, len(names), f"; put them into {data.path / 'images'}, or name their folder with --images"
-    )
+    data.lack(folder, missing, len(names), f"; put them into {data.path / home}, or name their folder with --images")
     return found
 
 

@@ -21,6 +21,7 @@ from surfkit.readers.depth_lens import fits_both, has_shape, judge, lens_in
 from surfkit.readers.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
 from surfkit.readers.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
 from surfkit.readers.made_maps import located
+from surfkit.readers.panoramas import has_panoramas, points_remedy
 from surfkit.readers.read import model_folder, observations
 from surfkit.scene.align import MAX_ERROR_PX, SCALE_BAND, align, sample
 from surfkit.scene.cache import Cache
@@ -197,7 +198,10 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
     """
     maps = prior_files(data, scene)
     if not maps:
-        remedy = f"; {prepare_command(data)}" if data.priors is None else ""
+        names = [view.name for view in scene.train]
+        lost = has_panoramas(names) and observations(data, scene).is_empty  # then there is nothing to compare them by
+        remedy = points_remedy(data.path, names) if lost else prepare_command(data)
+        remedy = f"; {remedy}" if data.priors is None else ""
         emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)

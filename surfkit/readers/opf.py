@@ -8,7 +8,8 @@ that of Pix4D's other files, as OpenCV has it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from surfkit.core.check import BadInput, leaving_out
+from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
@@ -101,7 +102,11 @@ def _read(data: Data) -> tuple[Capture, Seen]:
     cameras = [each for each in _entries(file, calibrated, "cameras") if each.get("id") in paths]
     if not cameras:
         raise BadInput(f"{file}: no camera in it that the list of cameras has; calibrate the project, and export it")
-    has = {each["id"] for each in cameras}
+    counts = Counter(each["id"] for each in cameras)
+    if twice := sorted({paths[number] for number, count in counts.items() if count > 1}):
+        reject(BadInput(f"{file}: more than one calibration of {few(twice)}; calibrate and export the project again"))
+        cameras = list({each["id"]: each for each in cameras}.values())  # to find more faults
+    has = counts.keys()
     lost = [paths[each] for each in taken if each in paths and each not in has]
     leave_out(file, photo_names(lost) if lost else [], len(has) + len(lost), "are not calibrated")
     names = photo_names([paths[each["id"]] for each in cameras])
@@ -125,6 +130,7 @@ def _read(data: Data) -> tuple[Capture, Seen]:
     named = {each["id"]: name for name, each in zip(names, cameras, strict=True)}
     marks = {} if sparse is None else sparse.seen
     seen = {named[number]: each for number, each in marks.items() if number in named and len(each[0])}
+    _tell_of_others(file, marks, named)
     groups = groups_of(shots, seen)
     return Capture(shots, xyz, rgb, metres=place.metres, crs=place.crs, shift=shift, groups=groups), seen
 
@@ -134,7 +140,27 @@ def _sparse(path: Path, project: Mapping[str, Any]) -> Points | None:
     items = [_entries(path, item, "resources") for item in _entries(path, project, "items")]
     used = [resources for resources in items if any(each.get("format") == CALIBRATED for each in resources)][-1]
     file = next((_file(path, each) for each in used if each.get("format") == GLTF), None)
-    return None if file is None else read_opf_points(file)
+    return None if file is None else read_opf_points(file, path.parent)
+
+
+def _tell_of_others(file: Path, marks: Mapping[int, tuple[np.ndarray, np.ndarray]], known: Collection[int]) -> None:
+    """A line about observations in photographs that a file of calibrated cameras does not have."""
+    counts = {number: len(rows) for number, (rows, _) in marks.items()}
+    lost, whole = sum(count for number, count in counts.items() if number not in known), sum(counts.values())
+    if lost and lost == whole:
+        emit(
+            Warned(
+                f"{file}: lacks the cameras that all {whole:,} observations of the sparse points name, so the points "
+                "are of another calibration, and which photographs show them is not known; export the project again"
+            )
+        )
+    elif lost:
+        emit(
+            Warned(
+                f"{file}: lacks the cameras that {lost:,} of {whole:,} observations of the sparse points name: these "
+                "are left out"
+            )
+        )
 
 
 def _files(root: Path) -> list[Path]:

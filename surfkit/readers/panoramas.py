@@ -7,7 +7,7 @@ right (x), its lower edge what lies below (y): COLMAP, OpenSfM, Metashape and ne
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -46,6 +46,8 @@ MARGIN = 4
 """Pixels of the other side that are put beyond each edge, for the interpolation."""
 GATE = Gate(1 << 30)
 """Bytes of panoramas that are cut at the same time; one always may be."""
+ALIGN = "align them with COLMAP or OpenSfM, whose models have points, and are read"
+"""How to get sparse points of panoramas."""
 PIXEL_BYTES = 12
 """Of a pixel of a panorama that is being cut: its layers, the margins, and one layer as floats."""
 
@@ -79,6 +81,25 @@ def parts_of(shot: Shot) -> list[Shot]:
 def view_names(shots: Sequence[Shot]) -> list[str]:
     """Names of the views that photographs give."""
     return [name for shot in shots for name in (_named(shot.name) if is_panorama(shot.camera) else [shot.name])]
+
+
+def has_panoramas(names: Iterable[str]) -> bool:
+    """Whether all six views of any panorama are among names of views."""
+    given = set(names)
+    fronts = (name.removesuffix("-front.png") for name in given if name.endswith("-front.png"))
+    return any(given.issuperset(_named(f"{stem}.png")) for stem in fronts)
+
+
+def points_remedy(path: Path, names: Iterable[str]) -> str:
+    """How to get sparse points, and which photographs show them, for a data set without.
+
+    Args:
+        path: The data set.
+        names: Of the views that its photographs give.
+    """
+    if has_panoramas(names):
+        return f"its photographs are panoramas, whose points surfkit does not find: {ALIGN}"
+    return f"`surfkit prepare points {path}` makes a data set with sparse points"
 
 
 def view_sizes(data: Data, shot: Shot, size: tuple[int, int]) -> list[tuple[int, int]]:

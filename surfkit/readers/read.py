@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput, reject
-from surfkit.core.events import Warned, emit
+from surfkit.core.events import Warned, emit, reading_again
 from surfkit.core.registry import components, find, name_of
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot
@@ -29,6 +29,7 @@ from surfkit.readers.panoramas import (
     cut,
     cut_tracks,
     parts_of,
+    points_remedy,
     size_to_read,
     view_names,
     view_sizes,
@@ -36,6 +37,7 @@ from surfkit.readers.panoramas import (
 )
 from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
+from surfkit.readers.record3d import PACKED
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import (
     Picture,
@@ -133,7 +135,7 @@ def build_scene(
         name=data.path.resolve().name,
         train=tuple(view for shot, view in views if shot not in held_out),
         held_out=tuple(view for shot, view in views if shot in held_out),
-        cloud=_cloud(capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
+        cloud=_cloud(data.path, capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
         frame=frame,
     )
     for line in decided.lines:
@@ -192,6 +194,9 @@ def reader_of(data: Data) -> Reader:
     root = data.path
     if is_video(root):
         raise BadInput(f"{root}: a video; {_finds_cameras(root)}")
+    if root.suffix.lower() == PACKED and root.is_file():
+        command = f"unzip {shlex.quote(str(root))} -d {shlex.quote(str(root.with_suffix('')))}"
+        raise BadInput(f"{root}: a packed scan of Record3D; `{command}` unpacks it; give the folder that this makes")
     if not root.is_dir():
         raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
     if not any(root.iterdir()):
@@ -203,6 +208,9 @@ def reader_of(data: Data) -> Reader:
     first = {name: reader for name, reader in fitting.items() if reader.priority == highest}
     if len(first) > 1:
         raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
+    inner = [] if first else [path for path in sorted(root.iterdir()) if path.is_dir() and _fitting(path)]
+    if inner:
+        raise BadInput(f"{root}: no data set itself, but the folder {inner[0].name!r} in it is one; give {inner[0]}")
     if not first and (photos := bare_photographs(root)):
         raise BadInput(
             f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
@@ -245,7 +253,8 @@ def observations(data: Data, scene: Scene) -> Observations:
         scene: That `read` gave for it.
     """
     reader = reader_of(data)
-    tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
+    with reading_again():  # most layouts have cameras and tracks in the same files
+        tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
     if tracks is None:
         return Observations(np.zeros((0, 3)), np.zeros(0), {})
     tracks = cut_tracks(tracks)
@@ -369,15 +378,15 @@ def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
     return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
 
 
-def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
+def _cloud(path: Path, capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
     if len(capture.xyz):
         xyz = frame.to_local(capture.xyz).astype(np.float32)
         return Cloud(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
     emit(
         Warned(
             f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
-            "cameras and of what lies before them, which takes longer and leaves more floaters; `surfkit prepare "
-            "points` makes a data set with points"
+            "cameras and of what lies before them, which takes longer and leaves more floaters; "
+            f"{points_remedy(path, view_names(capture.shots))}"
         )
     )
     local = np.stack([frame.local_pose(pose).numpy() for pose in poses])

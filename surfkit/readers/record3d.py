@@ -25,6 +25,7 @@ from surfkit.readers.transforms import points
 
 FILES = ("metadata", "metadata.json")
 PHOTOS = "rgbd"
+PACKED = ".r3d"
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Record3D(Reader):
         if own is not None and not (isinstance(own, list) and len(own) == len(poses)):
             raise BadInput(f"{path}: perFrameIntrinsicCoeffs is no list of a lens for each of {len(poses)} poses")
         names = [f"{PHOTOS}/{at}.jpg" for at in range(len(poses))]
-        found, shots, known = photographs(data, names), [], {}
+        found, shots, known = photographs(data, names, PHOTOS), [], {}
         width, height = (round(side) for side in numbers(f"{path}: w, h", [values["w"], values["h"]], 2).tolist())
         k = numbers(f"{path}: K", values["K"], 9).reshape(3, 3).T
         for at, name in enumerate(names):
@@ -72,7 +73,7 @@ def _file(root: Path) -> Path | None:
 
 
 def _packed(root: Path) -> Path | None:
-    return next(iter(sorted(root.glob("*.r3d"))), None)
+    return next(iter(sorted(root.glob(f"*{PACKED}"))), None)
 
 
 def _pose(where: str, given: Any) -> np.ndarray:

@@ -8,6 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.readers.depth_prior import Alignment, alignment, prior_bytes, prior_files, read_priors
+from surfkit.readers.panoramas import points_remedy
 from surfkit.readers.read import observations
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
@@ -75,6 +76,6 @@ def remedy(run: Run, scene: Scene) -> str:
     if prior_files(run.data, scene):
         return f"make others with `surfkit prepare depth {run.data.path} --again`"
     if observations(run.data, scene).is_empty:
-        return f"`surfkit prepare points {run.data.path}` makes a data set with the points that stereo needs"
+        return f"stereo needs sparse points: {points_remedy(run.data.path, (view.name for view in scene.train))}"
     let = "let the run make them, without --no-prepare and with depth:patch-match"
     return f"make some with `surfkit prepare depth {run.data.path}`, {let}"

@@ -22,6 +22,7 @@ from surfkit.core.stages import Stages, key_of
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.masks import find_masks
+from surfkit.readers.panoramas import ALIGN
 from surfkit.readers.placed import Placed
 from surfkit.readers.read import check_size, read_capture, reader_of
 from surfkit.readers.undistort import check_camera, is_panorama
@@ -69,7 +70,7 @@ class TiePoints:
         if whole := [shot.name for shot in capture.shots if is_panorama(shot.camera)]:
             raise BadInput(
                 f"{self.data.path}: {len(whole)} panoramas, {few(whole)}: points are triangulated between perspective "
-                "photographs only; align them with COLMAP or OpenSfM, whose models have points, and are read"
+                f"photographs only; {ALIGN}"
             )
         root, shots = _by_path(capture)
         self._tell_what_is_lost(capture)

@@ -198,7 +198,7 @@ FAULTS = {
         "the pose of 'view_003.png' is not finite",
     ),
     "lens": (lens("1 PINHOLE 64 48 -50 50 32 24"), "camera", "error", "(16 photographs)"),
-    "points": (lambda f: (f / POINTS).write_text(""), "no-points", "warning", "`surfkit prepare points`"),
+    "points": (lambda f: (f / POINTS).write_text(""), "no-points", "warning", "`surfkit prepare points "),
     "few": (lambda f: lines(f / POINTS, lambda rows: rows[::20]), "few-points", "warning", "only 75 sparse points"),
     "away": (moved_points((900, 900, 0)), "points-out-of-view", "error", "100% of the sparse points are in view of no"),
     "thin": (moved_points((900, 900, 0), 0.2), "thin-coverage", "warning", "in view of fewer than 3 training"),

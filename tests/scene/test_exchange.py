@@ -1,13 +1,17 @@
 """Cameras in formats for exchange and of scanning apps show known dots where the formulas of these formats put them."""
 
+import base64
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from surfkit.cli import main
 from surfkit.core.check import BadInput, collecting
+from surfkit.doctor.gather import heard
 from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import observations, read, read_capture, reader_of
@@ -255,6 +259,22 @@ def test_a_packed_file_of_record3d_is_told_to_be_unpacked(tmp_path):
         read(Data(tmp_path))
 
 
+def test_where_a_scan_of_record3d_lies_and_its_photographs_belong(tmp_path):
+    (tmp_path / "my scan").mkdir()
+    record3d(tmp_path / "my scan")
+    (tmp_path / "my scan.r3d").write_bytes(b"PK")
+    with pytest.raises(
+        BadInput, match=r"packed scan of Record3D; `unzip '\S+/my scan.r3d' -d '\S+/my scan'` unpacks it"
+    ):
+        read(Data(tmp_path / "my scan.r3d"))
+    (tmp_path / "my scan.r3d").unlink()
+    with pytest.raises(BadInput, match=r"no data set itself, but the folder 'my scan' in it is one; give \S+/my scan$"):
+        read(Data(tmp_path))
+    (tmp_path / "my scan/rgbd/1.jpg").unlink()
+    with pytest.raises(BadInput, match=r"missing: 'rgbd/1.jpg'; put them into \S+/my scan/rgbd, or name their folder"):
+        read(Data(tmp_path / "my scan"))
+
+
 def test_depth_of_record3d_is_told_and_one_lens_is_one_camera(tmp_path):
     record3d(tmp_path, own=True)
     (tmp_path / "rgbd/1.jpg").unlink()
@@ -347,6 +367,70 @@ def test_sparse_points_of_opf_keep_their_tracks(tmp_path):
     assert reader_of(some).tracks(some).seen.keys() == POSES.keys() - {"IMG 2.png"}
 
 
+def test_nodes_of_sparse_points_of_opf_lie_in_one_another(tmp_path):
+    """A quaternion, and the frame of the parent; a factor of each axis comes first."""
+    parent, child = Rotation.from_rotvec([0.3, -0.8, 0.5]), Rotation.from_rotvec([1.1, 0.2, -0.4])
+
+    def change(files):
+        inner = {"mesh": 0, "rotation": (2 * child.as_quat()).tolist(), "translation": [1, 2, 3], "scale": [1, 2, 0.5]}
+        outer = {"children": [0], "rotation": parent.as_quat().tolist(), "translation": [-4, 5, 6]}
+        files["tracks.gltf"]["nodes"] = [inner, outer]
+
+    opf(tmp_path, change=change)
+    data = Data(tmp_path)
+    x, y, z = (parent.apply(child.apply(DOTS * [1, 2, 0.5]) + [1, 2, 3]) + [-4, 5, 6]).T
+    np.testing.assert_allclose(read_capture(data, reader_of(data)).xyz, np.stack([x, -z, y], 1), atol=1e-5)
+
+
+def test_sparse_points_of_opf_in_the_file_itself_or_in_another_folder(tmp_path):
+    def change(files):
+        whole = (tmp_path / "parts/position.bin").read_bytes()
+        (tmp_path / "colour.bin").write_bytes((tmp_path / "parts/colour.bin").read_bytes())
+        files["tracks.gltf"]["buffers"][0]["uri"] = "data:a/b;base64," + base64.b64encode(whole).decode()
+        files["tracks.gltf"]["buffers"][1]["uri"] = "../colour.bin"
+
+    opf(tmp_path, change=change)
+    capture = read_capture(Data(tmp_path), reader_of(Data(tmp_path)))
+    np.testing.assert_allclose(capture.xyz, DOTS, atol=1e-5)
+    np.testing.assert_array_equal(capture.rgb, COLORS)
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (0, "lacks the cameras that all 80 observations of the sparse points name, so the points are of another"),
+        (3, "lacks the cameras that 20 of 80 observations of the sparse points name"),
+        (4, None),
+    ],
+)
+def test_sparse_points_of_opf_of_another_calibration(tmp_path, own, said):
+    def change(files):
+        known = files["tracks.gltf"]["meshes"][0]["primitives"][0]["extensions"]["OPF_mesh_primitive_matches"]
+        known["cameraUids"] = known["cameraUids"][:own] + list(range(100, 104 - own))
+
+    opf(tmp_path, change=change)
+    with collect_notes() as kept:
+        read(Data(tmp_path))
+    lines = [text for text in kept.texts if "observations" in text]
+    assert len(lines) == (said is not None) and all(f"calibrated.json: {said}" in text for text in lines)
+
+
+def test_what_an_opf_lacks_is_told_once(tmp_path):
+    """Its tracks are read anew, by each part of a run that needs them."""
+    opf(tmp_path)
+    data = Data(tmp_path)
+    with heard() as texts:
+        scene = read(data)
+        assert len(observations(data, scene).seen) == len(observations(data, scene).seen) == len(POSES)
+    assert sum("1 of 5 photographs are left out" in text for text in texts) == 1
+
+
+def test_doctor_tells_once_of_points_that_are_cut_off(tmp_path, capsys):
+    opf(tmp_path, change=at("tracks.gltf", "accessors", 0, "count", value=10**12))
+    assert main(["doctor", str(tmp_path), "recipe:surface", "--quick", "--probe", "0"]) == 2
+    assert capsys.readouterr().out.count("position.bin: cut off") == 1
+
+
 def test_opf_without_sparse_points_of_its_own(tmp_path):
     opf(tmp_path, change=lambda files: files["../survey.opf"]["items"][2]["resources"].pop())
     data = Data(tmp_path)
@@ -363,6 +447,10 @@ def test_sparse_points_of_opf_that_are_cut_off(tmp_path, name):
     path.unlink()
     with pytest.raises(BadInput, match=f"{name}.bin: cannot be read: No such file"):
         read(Data(tmp_path))
+
+
+MATCHES = ("meshes", 0, "primitives", 0, "extensions", "OPF_mesh_primitive_matches")
+TWICE = "calibrated.json: more than one calibration of '../photos/IMG 1.png'; calibrate and export the project again"
 
 
 def at(name, *path, value):
@@ -384,7 +472,35 @@ def at(name, *path, value):
         (at("calibrated.json", "cameras", value=3), "cameras is no list of objects"),
         (at("calibrated.json", "cameras", 0, "position", value=[1, 2]), "position: [1, 2], where 3 finite numbers"),
         (at("../survey.opf", "items", 2, "resources", value=[]), "names no file of calibrated-cameras"),
-        (at("tracks.gltf", "accessors", value=[]), "tracks.gltf: damaged, or not as OPF has sparse points: IndexError"),
+        (lambda files: files["calibrated.json"]["cameras"].append(files["calibrated.json"]["cameras"][0]), TWICE),
+        (at("tracks.gltf", "accessors", value=[]), "tracks.gltf: names number 0 of its 0 accessors"),
+        (at("tracks.gltf", "accessors", 0, value={}), "not as OPF has sparse points: 'bufferView' is missing; export"),
+        (
+            at("tracks.gltf", "accessors", 0, "bufferView", value=-1),
+            "tracks.gltf: names number -1 of its 5 bufferViews",
+        ),
+        (at("tracks.gltf", "accessors", 0, "count", value=10**12), "position.bin: cut off; copy the project whole"),
+        (at("tracks.gltf", "accessors", 0, "count", value=-3), "tracks.gltf: accessor 0 has -3 values from byte 8 on"),
+        (
+            at("tracks.gltf", "accessors", 0, "componentType", value=5130),
+            "accessor 0 is 'VEC3' of type 5130, which OPF",
+        ),
+        (at("tracks.gltf", "buffers", 0, "uri", value="../../x.bin"), "names '../../x.bin', which does not lie in the"),
+        (at("tracks.gltf", "buffers", 0, "uri", value="/etc/hosts"), "names '/etc/hosts', which does not lie in the"),
+        (
+            at("tracks.gltf", "buffers", 0, "uri", value="data:a/b,%00"),
+            "a buffer in it is not in base64: 'data:a/b,%00'",
+        ),
+        (
+            at("tracks.gltf", "buffers", 0, "uri", value="data:a/b;base64,AAAA"),
+            "tracks.gltf: cut off; copy the project",
+        ),
+        (at("tracks.gltf", "nodes", 0, "children", value=[0]), "tracks.gltf: node 0 is its own parent"),
+        (
+            at("tracks.gltf", "nodes", 0, value={"mesh": 0, "rotation": [0] * 4}),
+            "node 0: rotation: a quaternion of zeros",
+        ),
+        (at("tracks.gltf", *MATCHES, "cameraUids", value=[]), "its points have matches that are not there"),
         (at("tracks.gltf", "accessors", 4, "count", value=3), "its points have matches that are not there"),
         (at("tracks.gltf", "bufferViews", 4, "byteStride", value=16), "its buffers are interleaved"),
         (at("tracks.gltf", "accessors", 0, "byteOffset", value=4), "its buffers are interleaved"),
@@ -398,3 +514,4 @@ def test_opf_that_is_refused(tmp_path, change, said):
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert str(caught.value).count(";") <= 1, "advice once"

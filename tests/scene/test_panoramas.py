@@ -373,3 +373,18 @@ def test_the_edge_of_a_panorama_is_no_edge_in_a_view(tmp_path):
     for face, other in (("front", "back"), ("back", "front"), ("left", "right"), ("right", "left")):
         assert np.abs(found[f"a-{face}.png"] - found[f"b-{other}.png"]).max() <= 1, face
     assert np.abs(found["a-up.png"] - found["b-up.png"][:, ::-1, ::-1]).max() <= 1
+
+
+def test_every_line_says_how_panoramas_get_the_points_that_depth_maps_need(tmp_path, capsys):
+    """Of nerfstudio's panoramas, which have no tracks, `prepare points` makes none, and `prepare depth` needs some."""
+    nerfstudio(tmp_path / "data")
+    data, out = str(tmp_path / "data"), str(tmp_path / "run")
+    assert main(["doctor", data, "recipe:surface", "--quick", "--probe", "0"]) == 2
+    said = [capsys.readouterr().out]
+    assert "error: the run begins at depth maps: there are no depth priors, and none can be made" in said[0]
+    for command in (["prepare", "depth"], ["train", "recipe:surface", "--out", out, "--data"]):
+        assert main([*command, data]) == 2
+        said.append(capsys.readouterr().err)
+    for text in said:
+        assert text.count("panoramas, whose points surfkit does not find: align them with COLMAP or OpenSfM") >= 2
+        assert "surfkit prepare" not in text
