@@ -86,7 +86,8 @@ def with_opacity(masks: Mapping[str, Mask], shots: Sequence[Shot], decided: Deci
 def read_mask(path: Path, size: tuple[int, int], alpha: bool = False) -> Tensor:
     """(H, W) bool of a mask at another size: False where it is black, and the pixel is to be ignored.
 
-    Black is the lower half of the values; in a mask of 0 and 1 it is 0.
+    Black is the lower half of the values, 0 to 255 or 65535; in a mask of two values only, it is the lower one. Of
+    colours, in whatever mode they are stored, the brightest channel counts.
 
     Args:
         path: Any picture.
@@ -99,17 +100,21 @@ def read_mask(path: Path, size: tuple[int, int], alpha: bool = False) -> Tensor:
 
     def decode(image: Image.Image) -> np.ndarray:
         if alpha and has_opacity(image):
-            return np.asarray(Image.fromarray(opacity_of(image)).resize(size, Image.Resampling.NEAREST)) > 127
-        plain = image.convert("L") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image
-        values = np.asarray(plain.resize(size, Image.Resampling.NEAREST))
-        return values.max(-1) if values.ndim == 3 else values
+            return np.array(Image.fromarray(opacity_of(image)).resize(size, Image.Resampling.NEAREST)) > 127
+        wanted = {"1": "L", "LA": "L", "P": "RGB", "PA": "RGB", "RGBA": "RGB", "CMYK": "RGB"}
+        values = np.asarray(image.convert(wanted[image.mode]) if image.mode in wanted else image)
+        kept = _is_kept(values.max(-1) if values.ndim == 3 else values)
+        return np.array(Image.fromarray(kept).resize(size, Image.Resampling.NEAREST))
 
-    values = open_picture(path, decode)
-    if values.dtype == bool:
-        return torch.from_numpy(values)
-    most = int(values.max(initial=0))
-    half = 0 if most <= 1 else 127 if most <= 255 else 32767
-    return torch.from_numpy(values > half)
+    return torch.from_numpy(open_picture(path, decode))
+
+
+def _is_kept(values: np.ndarray) -> np.ndarray:
+    """(H, W) bool of the values of a mask, see `read_mask`."""
+    least, most = values.min(initial=0), values.max(initial=0)
+    if 0 <= least < most and ((values == least) | (values == most)).all():
+        return values == most
+    return values > (0 if most <= 1 else 127 if most <= 255 else 32767)
 
 
 def mask_cache(views: Sequence[View], budget_bytes: int | None = None) -> Cache[Tensor | None] | None:
@@ -159,7 +164,7 @@ class _Emptied:
 
     def __init__(self, views: Sequence[View]) -> None:
         self._views, self._empty, self._lock = views, [], threading.Lock()
-        self._left = {at for at, view in enumerate(views) if view.mask is not None}
+        self._left = {at for at, view in enumerate(views) if view.mask is not None and not view.mask.is_part}
 
     def note(self, at: int, keeps: bool) -> None:
         """The mask of a position was read, and keeps something or not."""

@@ -19,9 +19,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot, Tracks, camera_of
 from surfkit.readers.data import Data
-from surfkit.readers.masks import read_mask
+from surfkit.readers.masks import empty_masks, read_mask
 from surfkit.readers.undistort import PANORAMA, Picture, is_panorama, read_layers, resampled, save_mask, save_picture
 from surfkit.scene.copies import digest, place
 from surfkit.scene.gate import Gate
@@ -145,14 +146,17 @@ def cut(shot: Shot, picture: Picture, side: int, root: Path, keep: Path | None =
         with GATE.taking(PIXEL_BYTES * picture.size[0] * picture.size[1]):
             layers, kept = _with_margins(read_layers(picture, picture.size)), None
             if mask is not None:
-                kept = _with_margins(read_mask(mask.path, picture.size, mask.alpha)[None])
+                whole = read_mask(mask.path, picture.size, mask.alpha)
+                if not whole.any():
+                    emit(Warned(empty_masks([shot.name])))
+                kept = _with_margins(whole[None])
             for face in lacking:
                 grid = _grid(face, shot.camera.width, side, picture.size)
                 if kept is not None:
                     save_mask(masks[face], grid_sample(kept[None].float(), grid, "nearest", align_corners=False)[0, 0])
                 save_picture(files[face], resampled(layers, grid))  # last: with it, the mask is there too
     return [
-        (view, replace(part, path=files[face], mask=Mask(masks[face]) if mask else None, pixels=PLAIN))
+        (view, replace(part, path=files[face], mask=Mask(masks[face], is_part=True) if mask else None, pixels=PLAIN))
         for face, (view, part) in zip(FACES, views_of(shot, picture, side), strict=True)
     ]
 

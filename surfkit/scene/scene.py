@@ -43,10 +43,12 @@ class Mask:
     Attributes:
         path: A picture on disk; that of the photograph itself where its opacity is the mask.
         alpha: Whether its alpha channel counts: what is opaque is kept. If not, its colours: what is black is ignored.
+        is_part: Whether it is of one view of a panorama, of which it may keep nothing.
     """
 
     path: Path
     alpha: bool = False
+    is_part: bool = False
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,10 @@ LIKELY = (0.1, 10.0)
 MOST_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
 ABOVE, BELOW = (0, 2), (1, 3)
-"""References of altitudes: sea level, and from EXIF 3.0 on the ellipsoid."""
-ELLIPSOID = (2, 3)
+"""References of altitudes, see `_zero`."""
+SEA_LEVEL = (2, 3)
+VERSION = 36864
+"""Tag of the version of EXIF: 0232, 0300."""
 RTK_FLAG = "RtkFlag"
 """In XMP of DJI: 0 without RTK; 16, 34 or 50 where the position is of that receiver."""
 Zero = Literal["sea level", "ellipsoid"]
@@ -119,7 +121,7 @@ def facts(
         position=position,
         unsigned=unsigned,
         no_reference=position is not None and position[2] is not None and _reference(gps) is None,
-        zero=_zero(gps, xmp),
+        zero=_zero(gps, camera, xmp),
         xmp_position=_xmp_position(xmp),
         xmp_altitude=xmp.get(xmp_names.ALTITUDE),
         above_start=xmp.get(xmp_names.ABOVE_START),
@@ -190,12 +192,19 @@ def _reference(tags: Mapping[int, Any]) -> int | None:
     return found if found in (*ABOVE, *BELOW) else None
 
 
-def _zero(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> Zero | None:
-    """What altitudes are counted from: sea level by the standard, also where nothing is said. Drones with RTK write
-    heights above the ellipsoid, under the reference of sea level, as older EXIF has no other."""
+def _zero(gps: Mapping[int, Any], camera: Mapping[int, Any], xmp: Mapping[str, float]) -> Zero | None:
+    """What altitudes are counted from.
+
+    References 2 and 3 are the sea level. 0 and 1 were it until EXIF 3.0, which made them the ellipsoid. Drones with RTK
+    write heights above the ellipsoid under the old 0, as there was no other.
+    """
     if ALTITUDE not in gps and xmp_names.ALTITUDE not in xmp:
         return None
-    return "ellipsoid" if _reference(gps) in ELLIPSOID or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
+    reference = _reference(gps)
+    if reference in SEA_LEVEL:
+        return "sea level"
+    is_new = reference is not None and (_text(camera.get(VERSION)) or "") >= "0300"
+    return "ellipsoid" if is_new or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
 
 
 def _xmp_position(xmp: Mapping[str, float]) -> Position | None:

@@ -36,6 +36,8 @@ from surfkit.sfm.site import Reading, decide, heights_named, locate, readings
 from surfkit.sfm.sources import Sources, look_at_all
 
 PICTURE = "cameras.png"
+SOURCE = "source.txt"
+"""In the work folder: the folder that the photographs are from. They may change there, as when all are saved anew."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,11 @@ class Preparation:
         path = self.work / PHOTOGRAPHS
         before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
-        _refuse_others(self.scene, self.root, before, photos)
+        root, source = str(self.root.resolve()), self.work / SOURCE
+        if not (source.is_file() and source.read_text(encoding="utf-8") == root):
+            _refuse_others(self.scene, self.root, before, photos)
         write_json(path, photos)
+        source.write_text(root, encoding="utf-8")
         return sources, photos
 
     def _deliver(self, models: Sequence[tuple[Any, Placed | None]], photos: dict[str, Photo], sources: Sources) -> None:
@@ -238,12 +243,13 @@ class Preparation:
 
 
 def _refuse_others(scene: Path, root: Path, before: Sequence[Photo], photos: Sequence[Photo]) -> None:
-    """BadInput where a scene was prepared from photographs of which none is there now, by its name and what it shows:
-    drones call those of each flight alike."""
+    """BadInput where a scene was prepared from photographs of another folder, most of which are not there now, by their
+    names and what they show: drones call those of each flight alike."""
     now = {photo.name: photo for photo in photos}
     known = [photo for photo in before if photo.usable]
     named = [photo for photo in known if photo.name in now]
-    if not known or any(photo.shows_what(now[photo.name]) for photo in named):
+    same = sum(photo.shows_what(now[photo.name]) for photo in named)
+    if not known or 2 * same > len(named):
         return
     why = f"those in {root} have the same names and show something else" if named else f"none of them is in {root}"
     raise BadInput(

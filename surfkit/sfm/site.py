@@ -144,8 +144,8 @@ def heights_named(where: Placement, photos: Sequence[Photo], given: str) -> tupl
         )
     if zeros == {"sea level"} and axes is not None and not says_height:
         return where, (
-            f"heights are above sea level, as is the rule in EXIF, and --crs {crs} does not say so; a system such as "
-            f"{crs}{EGM96} (EGM96) does"
+            f"--crs {crs} has no vertical part: heights are taken as they are, which EXIF counts from sea level by its "
+            "rule"
         )
     if zeros == {"ellipsoid"}:
         above = "heights are above the ellipsoid, as RTK (XMP) or GPSAltitudeRef in EXIF say"

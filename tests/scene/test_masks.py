@@ -127,6 +127,23 @@ def test_masks_of_zero_and_one_and_of_sixteen_bits(tmp_path):
     assert not read_mask(tmp_path / "none.png", (40, 30)).any()
 
 
+@pytest.mark.parametrize("mode", ["RGB", "P", "RGBA"])
+def test_the_brightest_channel_counts_however_colours_are_stored(tmp_path, mode):
+    stripes = np.array([(0, 0, 0), (200, 0, 0), (0, 200, 0), (0, 0, 200), (90, 90, 90)], np.uint8)
+    picture = Image.fromarray(np.tile(np.repeat(stripes, 8, 0), (30, 1, 1))).convert("RGB")
+    (picture.quantize(8) if mode == "P" else picture.convert(mode)).save(tmp_path / "mask.png")
+    kept = read_mask(tmp_path / "mask.png", (40, 30))[0].reshape(5, 8)
+    assert kept.all(1).tolist() == [False, True, True, True, False] and kept.any(1).tolist() == kept.all(1).tolist()
+
+
+@pytest.mark.parametrize(("low", "high", "kind"), [(0, 2, np.uint8), (0, 100, np.uint8), (0, 1000, np.uint16)])
+def test_of_two_values_the_higher_one_is_kept(tmp_path, low, high, kind):
+    Image.fromarray(np.where(left_black() > 0, high, low).astype(kind)).save(tmp_path / "mask.png")
+    kept = torch.from_numpy(left_black() > 0)
+    assert torch.equal(read_mask(tmp_path / "mask.png", (40, 30)), kept)
+    assert torch.equal(read_mask(tmp_path / "mask.png", (20, 15)), kept[1::2, 1::2])
+
+
 def test_a_mask_of_another_size_keeps_its_edges(tmp_path):
     put(tmp_path / "mask.png", left_black((400, 300)))
     assert torch.equal(read_mask(tmp_path / "mask.png", (40, 30)), torch.from_numpy(left_black() > 0))

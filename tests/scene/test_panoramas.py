@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.data import Data
 from surfkit.readers.fingerprint import changed, fingerprint
-from surfkit.readers.masks import view_mask
+from surfkit.readers.masks import mask_cache, view_mask
 from surfkit.readers.panoramas import FACES
 from surfkit.readers.read import observations, read
 from surfkit.run.notes import collect_notes
@@ -185,7 +185,16 @@ def test_masks_of_panoramas_are_cut_with_them(tmp_path):
     mask = np.where(ahead()[..., 1:] > 0.5, 0, 255).astype(np.uint8)[..., 0]  # black below
     for name in NAMES:
         Image.fromarray(mask).save(tmp_path / "masks" / name)
-    for view in read(Data(tmp_path)).train:
+    Image.fromarray(np.zeros_like(mask)).save(tmp_path / "masks" / NAMES[-1])
+    with collect_notes() as notes:
+        scene = read(Data(tmp_path))
+        cached = mask_cache(scene.train)
+        assert not all(cached[at].any() for at in range(len(scene.train))), "the views down show nothing"
+    empty = [text for text in notes.texts if "nothing of the photograph" in text]
+    assert empty == [f"1 mask keeps nothing of the photograph, {NAMES[-1]!r}; correct or delete it"], (
+        "of views, no word"
+    )
+    for view in (view for view in scene.train if not view.name.startswith(NAMES[-1].partition(".")[0])):
         v, u = np.mgrid[:88, :88] + 0.5
         local = np.stack([u - 44, v - 44, np.full_like(u, WIDTH / 2 / np.pi)], -1)
         inside = np.array(FACES[view.name.rpartition("-")[2].removesuffix(".png")], float)

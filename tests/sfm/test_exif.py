@@ -40,15 +40,18 @@ def test_a_photograph_that_says_nothing(photo):
 
 
 @pytest.mark.parametrize(
-    ("reference", "flag", "zero"),
-    [(0, None, "sea level"), (1, 0, "sea level"), (None, None, "sea level"), (2, None, "ellipsoid")]
-    + [(3, None, "ellipsoid"), (0, 50, "ellipsoid"), (0, 16, "ellipsoid")],
+    ("reference", "version", "flag", "zero"),
+    [(0, b"0232", None, "sea level"), (1, None, 0, "sea level"), (None, b"0300", None, "sea level")]
+    + [(2, b"0300", None, "sea level"), (3, None, 50, "sea level"), (0, b"0300", None, "ellipsoid")]
+    + [(1, b"0310", None, "ellipsoid"), (0, None, 50, "ellipsoid"), (0, b"0232", 16, "ellipsoid")],
 )
-def test_where_altitudes_are_0(reference, flag, zero):
-    """Sea level by the standard; drones with RTK write heights above the ellipsoid under its reference."""
+def test_where_altitudes_are_0(reference, version, flag, zero):
+    """2 and 3 are sea level. 0 and 1 are it up to EXIF 2.32, and the ellipsoid from 3.0 on (CIPA DC-008); drones with
+    RTK write heights above the ellipsoid under the older 0."""
     gps = {exif.ALTITUDE: 120.0} | ({} if reference is None else {exif.ALTITUDE_REF: bytes([reference])})
     xmp = {} if flag is None else {"RtkFlag": float(flag)}
-    assert facts({}, {}, gps, xmp, (40, 30)).zero == zero
+    camera = {} if version is None else {36864: version}
+    assert facts({}, camera, gps, xmp, (40, 30)).zero == zero
     assert facts({}, {}, {exif.ALTITUDE_REF: b"\0"}, xmp, (40, 30)).zero is None, "no altitude"
 
 

@@ -353,6 +353,14 @@ def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
     save(tmp_path / "c/a3.jpg", picture(arc(4)[3]))
     assert main([*words, str(tmp_path / "c")]) == 0
     assert {path.name for path in (scene / "images").iterdir()} == {"a0.jpg", "a1.jpg", "a3.jpg"}
+    for path in (tmp_path / "c").iterdir():  # where they lay, all saved anew and brighter
+        Image.fromarray(np.minimum(np.asarray(Image.open(path)) * 1.1, 255).astype(np.uint8)).save(path, quality=80)
+    assert main([*words, str(tmp_path / "c")]) == 0
+    for name in ("a0.jpg", "a3.jpg"):  # in another folder, most of them of another flight
+        save(tmp_path / "d" / name, picture(arc(3)[0], 9))
+    shutil.copyfile(tmp_path / "c/a1.jpg", tmp_path / "d/a1.jpg")
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "d")]) == 2 and "show something else" in capsys.readouterr().err
     assert main(["prepare", "photos", "--out", str(tmp_path / "two"), str(tmp_path / "both")]) == 0
     looked = json.loads((tmp_path / "two/prepare/photographs.json").read_text())
     assert [photo["name"] for photo in looked] == [f"{folder}/{at}.jpg" for folder in "ab" for at in range(3)]

@@ -169,7 +169,12 @@ def test_heights_that_count_down_are_found_out_where_they_vary():
             "EPSG:32756+5773",
             "(EGM96); where the drone counts them from the ellipsoid, give --crs",
         ),
-        (["sea level"], "EPSG:32756", "EPSG:32756", "does not say so; a system such as EPSG:32756+5773"),
+        (
+            ["sea level"],
+            "EPSG:32756",
+            "EPSG:32756",
+            "--crs EPSG:32756 has no vertical part: heights are taken as they are",
+        ),
         (["sea level"], "EPSG:32756+5773", "EPSG:32756+5773", None),
         (["ellipsoid"], "auto", "EPSG:32756", "heights are above the ellipsoid, as RTK"),
         (["ellipsoid"], "EPSG:32756+5773", "EPSG:32756+5773", "says something else; leave its vertical part out"),
