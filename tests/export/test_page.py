@@ -17,6 +17,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import torch
+from needs import needs
 from PIL import Image
 
 from surfkit.core.check import BadInput
@@ -261,7 +262,7 @@ def test_the_script_decodes_and_sorts(tmp_path):
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory):
     """Draws a page in Chromium without a GPU: a file to its picture, (H, W, 3) float64 of 0 to 1."""
-    connect = pytest.importorskip("websockets.sync.client").connect
+    connect = needs("websockets.sync.client", "a websocket client").connect
     home = tmp_path_factory.mktemp("browser")
     flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     flags += ["--remote-debugging-port=0", f"--user-data-dir={home}", "about:blank"]
