@@ -111,8 +111,8 @@ def read_mask(path: Path, size: tuple[int, int], alpha: bool = False) -> Tensor:
 
 def _is_kept(values: np.ndarray) -> np.ndarray:
     """(H, W) bool of the values of a mask, see `read_mask`."""
-    least, most = values.min(initial=0), values.max(initial=0)
-    if 0 <= least < most and ((values == least) | (values == most)).all():
+    least, most = values.min(), values.max()
+    if least < most and ((values == least) | (values == most)).all():
         return values == most
     return values > (0 if most <= 1 else 127 if most <= 255 else 32767)
 

@@ -136,12 +136,19 @@ def test_the_brightest_channel_counts_however_colours_are_stored(tmp_path, mode)
     assert kept.all(1).tolist() == [False, True, True, True, False] and kept.any(1).tolist() == kept.all(1).tolist()
 
 
-@pytest.mark.parametrize(("low", "high", "kind"), [(0, 2, np.uint8), (0, 100, np.uint8), (0, 1000, np.uint16)])
+@pytest.mark.parametrize(("low", "high", "kind"), [(0, 2, np.uint8), (100, 120, np.uint8), (0, 1000, np.uint16)])
 def test_of_two_values_the_higher_one_is_kept(tmp_path, low, high, kind):
     Image.fromarray(np.where(left_black() > 0, high, low).astype(kind)).save(tmp_path / "mask.png")
     kept = torch.from_numpy(left_black() > 0)
     assert torch.equal(read_mask(tmp_path / "mask.png", (40, 30)), kept)
     assert torch.equal(read_mask(tmp_path / "mask.png", (20, 15)), kept[1::2, 1::2])
+
+
+@pytest.mark.parametrize(("value", "kept"), [(0, False), (1, True), (2, False), (100, False), (255, True)])
+def test_a_mask_of_one_value(tmp_path, value, kept):
+    Image.fromarray(np.full((30, 40), value, np.uint8)).save(tmp_path / "mask.png")
+    found = read_mask(tmp_path / "mask.png", (40, 30))
+    assert found.all() if kept else not found.any()
 
 
 def test_a_mask_of_another_size_keeps_its_edges(tmp_path):
