@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,11 +93,11 @@ class Preparation:
         path = self.work / PHOTOGRAPHS
         before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
-        root, source = str(self.root.resolve()), self.work / SOURCE
-        if not (source.is_file() and source.read_text(encoding="utf-8") == root):
+        root, source = os.fsencode(self.root.resolve()), self.work / SOURCE  # bytes: names need not be UTF-8
+        if not (source.is_file() and source.read_bytes() == root):
             _refuse_others(self.scene, self.root, before, photos)
         write_json(path, photos)
-        source.write_text(root, encoding="utf-8")
+        source.write_bytes(root)
         return sources, photos
 
     def _deliver(self, models: Sequence[tuple[Any, Placed | None]], photos: dict[str, Photo], sources: Sources) -> None:

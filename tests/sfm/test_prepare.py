@@ -1,8 +1,10 @@
 """`surfkit prepare photos`, from a folder of photographs of a known scene to a data set on the map."""
 
 import json
+import os
 import re
 import shutil
+import sys
 from hashlib import sha256
 
 import numpy as np
@@ -365,6 +367,17 @@ def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
     looked = json.loads((tmp_path / "two/prepare/photographs.json").read_text())
     assert [photo["name"] for photo in looked] == [f"{folder}/{at}.jpg" for folder in "ab" for at in range(3)]
     assert {path.parent.name for path in (tmp_path / "two/images").rglob("*.jpg")} == {"a", "b"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of folders are Unicode there")
+def test_a_folder_whose_name_is_not_utf8(tmp_path):
+    folder = tmp_path / os.fsdecode(b"\xff")
+    for at in range(3):
+        save(folder / f"{at}.jpg", picture(arc(3)[at]))
+    words = ["prepare", "photos", "--no-gps", "--out", str(tmp_path / "s"), str(folder)]
+    assert main(words) == 0
+    (tmp_path / "s/prepare/source.txt").write_bytes(b"\xfe")  # damaged: taken for another folder
+    assert main(words) == 0
 
 
 def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):
