@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -125,7 +126,7 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
             except OSError as error:
                 raise BadInput(
                     f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, "
-                    f"make them with `surfkit prepare depth {data}`, or do without: --no-prepare"
+                    f"make them with `surfkit prepare depth {shlex.quote(str(data))}`, or do without: --no-prepare"
                 ) from error
             time.sleep(POLL_S)
         yield

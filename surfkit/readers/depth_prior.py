@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -338,7 +339,7 @@ def normals_warning(data: Data, files: Sequence[DepthFile]) -> str | None:
     without = sum(not normal_path(file.path).exists() for file in files)
     if not without:
         return None
-    remedy = f"make others with `surfkit prepare depth {data.path} --again`"
+    remedy = f"make others with `surfkit prepare depth {shlex.quote(str(data.path))} --again`"
     remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
     what = f"{without} of {len(files)} depth priors have no normals"
     return f"{what}, and the loss normal-prior learns nothing from those; {remedy}"
@@ -346,4 +347,4 @@ def normals_warning(data: Data, files: Sequence[DepthFile]) -> str | None:
 
 def prepare_command(data: Data) -> str:
     """Which command makes depth priors, with normals."""
-    return f"make them with `surfkit prepare depth {data.path}`"
+    return f"make them with `surfkit prepare depth {shlex.quote(str(data.path))}`"

@@ -25,6 +25,9 @@ from surfkit.scene.scene import Mask, View
 FOLDER = "masks"
 MARKS = (".mask", "_mask")
 """What may follow the name of a photograph, before the ending."""
+LABELLED, MOST_LABELS = 0.01, 16
+"""Share of the pixels left out that are not black, and number of different values, up to which a mask may be one of
+labels."""
 ENDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 THREADS = 4
 
@@ -103,7 +106,10 @@ def read_mask(path: Path, size: tuple[int, int], alpha: bool = False) -> Tensor:
             return np.array(Image.fromarray(opacity_of(image)).resize(size, Image.Resampling.NEAREST)) > 127
         wanted = {"1": "L", "LA": "L", "P": "RGB", "PA": "RGB", "RGBA": "RGB", "CMYK": "RGB"}
         values = np.asarray(image.convert(wanted[image.mode]) if image.mode in wanted else image)
-        kept = _is_kept(values.max(-1) if values.ndim == 3 else values)
+        values = values.max(-1) if values.ndim == 3 else values
+        kept = _is_kept(values)
+        if _has_labels(values, kept):
+            _tell_labels(path)
         return np.array(Image.fromarray(kept).resize(size, Image.Resampling.NEAREST))
 
     return torch.from_numpy(open_picture(path, decode))
@@ -115,6 +121,30 @@ def _is_kept(values: np.ndarray) -> np.ndarray:
     if least < most and ((values == least) | (values == most)).all():
         return values == most
     return values > (0 if most <= 1 else 127 if most <= 255 else 32767)
+
+
+def _has_labels(values: np.ndarray, kept: np.ndarray) -> bool:
+    """Whether much of what the values (H, W) of a mask leave out is not their least one, as in a picture of labels; not
+    so soft edges and the noise of JPEG, which have many values."""
+    below = values[~kept]
+    return bool(below.size) and (below > below.min()).mean() > LABELLED and len(np.unique(values)) <= MOST_LABELS
+
+
+@lru_cache(maxsize=256)
+def _labelled(folder: Path) -> list[Path]:
+    """The masks of a folder that were told to have labels: the first one."""
+    return []
+
+
+def _tell_labels(path: Path) -> None:
+    if not (told := _labelled(path.parent)):
+        told.append(path)
+        emit(
+            Warned(
+                f"{path}: the mask has more values than two, and those up to half of the full range are ignored as "
+                "black; where it has labels, write 0 for what is to be ignored and 255 for the rest"
+            )
+        )
 
 
 def mask_cache(views: Sequence[View], budget_bytes: int | None = None) -> Cache[Tensor | None] | None:

@@ -7,6 +7,7 @@ right (x), its lower edge what lies below (y): COLMAP, OpenSfM, Metashape and ne
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -100,7 +101,7 @@ def points_remedy(path: Path, names: Iterable[str]) -> str:
     """
     if has_panoramas(names):
         return f"its photographs are panoramas, whose points surfkit does not find: {ALIGN}"
-    return f"`surfkit prepare points {path}` makes a data set with sparse points"
+    return f"`surfkit prepare points {shlex.quote(str(path))}` makes a data set with sparse points"
 
 
 def view_sizes(data: Data, shot: Shot, size: tuple[int, int]) -> list[tuple[int, int]]:

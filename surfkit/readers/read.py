@@ -57,6 +57,8 @@ from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size, refuse_large
 from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
 
+NO_NUMBER = 2**32 - 1
+"""What pycolmap calls cameras of programs that do not number them."""
 RANDOM_POINTS = 50_000
 """Where a data set has no sparse points."""
 
@@ -350,9 +352,9 @@ def check_size(shot: Shot, size: tuple[int, int]) -> None:
         advice = (
             "the model was made from photographs turned as EXIF says, so save them like that (mogrify -auto-orient)"
         )
+    number = f" {shot.camera.camera_id}" if shot.camera.camera_id < NO_NUMBER else ""
     raise BadInput(
-        f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera {shot.camera.camera_id} has "
-        f"{full[0]} x {full[1]}; {advice}"
+        f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera{number} has {full[0]} x {full[1]}; {advice}"
     )
 
 

@@ -48,7 +48,9 @@ class Record3D(Reader):
         if not isinstance(poses, list) or not poses:
             raise BadInput(f"{path}: no list of poses; record with camera poses, and export again")
         if own is not None and not (isinstance(own, list) and len(own) == len(poses)):
-            raise BadInput(f"{path}: perFrameIntrinsicCoeffs is no list of a lens for each of {len(poses)} poses")
+            raise BadInput(
+                f"{path}: perFrameIntrinsicCoeffs is no list of a lens for each of {len(poses)} poses; export again"
+            )
         names = [f"{PHOTOS}/{at}.jpg" for at in range(len(poses))]
         found, shots, known = photographs(data, names, PHOTOS), [], {}
         width, height = (round(side) for side in numbers(f"{path}: w, h", [values["w"], values["h"]], 2).tolist())

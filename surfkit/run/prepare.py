@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -92,7 +93,7 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
     elif caches.maps is None:
         raise BadInput(
             f"{run.out}: the mesh needs depth maps, and there are none; leave out --no-prepare to make them, or give "
-            f"`surfkit prepare depth {run.data.path}` first"
+            f"`surfkit prepare depth {shlex.quote(str(run.data.path))}` first"
         )
     else:
         prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)

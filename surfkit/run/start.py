@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 
 import torch
@@ -74,8 +75,8 @@ def remedy(run: Run, scene: Scene) -> str:
     if run.data.priors is not None:
         return "see whether photographs and cameras belong together, and which points they share"
     if prior_files(run.data, scene):
-        return f"make others with `surfkit prepare depth {run.data.path} --again`"
+        return f"make others with `surfkit prepare depth {shlex.quote(str(run.data.path))} --again`"
     if observations(run.data, scene).is_empty:
         return f"stereo needs sparse points: {points_remedy(run.data.path, (view.name for view in scene.train))}"
     let = "let the run make them, without --no-prepare and with depth:patch-match"
-    return f"make some with `surfkit prepare depth {run.data.path}`, {let}"
+    return f"make some with `surfkit prepare depth {shlex.quote(str(run.data.path))}`, {let}"

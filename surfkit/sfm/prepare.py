@@ -96,6 +96,13 @@ class Preparation:
         root, source = os.fsencode(self.root.resolve()), self.work / SOURCE  # bytes: names need not be UTF-8
         if not (source.is_file() and source.read_bytes() == root):
             _refuse_others(self.scene, self.root, before, photos)
+        elif before and not any(photo.shows_what(other) for photo, other in _alike(before, photos)):
+            emit(
+                Warned(
+                    f"{self.root}: no photograph is as it was when {self.scene} was prepared; it is made anew, and "
+                    "runs on it cannot be used any more"
+                )
+            )
         write_json(path, photos)
         source.write_bytes(root)
         return sources, photos
@@ -246,17 +253,21 @@ class Preparation:
 def _refuse_others(scene: Path, root: Path, before: Sequence[Photo], photos: Sequence[Photo]) -> None:
     """BadInput where a scene was prepared from photographs of another folder, most of which are not there now, by their
     names and what they show: drones call those of each flight alike."""
-    now = {photo.name: photo for photo in photos}
     known = [photo for photo in before if photo.usable]
-    named = [photo for photo in known if photo.name in now]
-    same = sum(photo.shows_what(now[photo.name]) for photo in named)
-    if not known or 2 * same > len(named):
+    named = _alike(known, photos)
+    if not known or 2 * sum(photo.shows_what(other) for photo, other in named) > len(named):
         return
-    why = f"those in {root} have the same names and show something else" if named else f"none of them is in {root}"
+    why = f"most of those names in {root} show something else" if named else f"none of them is in {root}"
     raise BadInput(
         f"{scene} was prepared from other photographs, {few([photo.name for photo in known])}, and {why}; name another "
         f"folder with --out, or delete {scene}"
     )
+
+
+def _alike(before: Sequence[Photo], photos: Sequence[Photo]) -> list[tuple[Photo, Photo]]:
+    """Photographs of before, and those of the same names."""
+    now = {photo.name: photo for photo in photos}
+    return [(photo, now[photo.name]) for photo in before if photo.name in now]
 
 
 def _name_wrong(where: Placement | Control) -> None:

@@ -144,6 +144,18 @@ def test_of_two_values_the_higher_one_is_kept(tmp_path, low, high, kind):
     assert torch.equal(read_mask(tmp_path / "mask.png", (20, 15)), kept[1::2, 1::2])
 
 
+def test_labels_are_told_once_for_a_folder(tmp_path):
+    labels = np.repeat(np.array([[0, 1, 2, 255]], np.uint8), 30, 0).repeat(10, 1)
+    soft = np.tile(np.arange(256).astype(np.uint8), (30, 1))
+    for name, pixels in {"a": labels, "b": labels, "soft/c": soft, "two/d": left_black()}.items():
+        path = tmp_path / f"{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(pixels).save(path)
+        with collect_notes() as notes:
+            read_mask(path, (40, 30))
+        assert [text.startswith(f"{path}: the mask has more values") for text in notes.texts] == [True] * (name == "a")
+
+
 @pytest.mark.parametrize(("value", "kept"), [(0, False), (1, True), (2, False), (100, False), (255, True)])
 def test_a_mask_of_one_value(tmp_path, value, kept):
     Image.fromarray(np.full((30, 40), value, np.uint8)).save(tmp_path / "mask.png")
