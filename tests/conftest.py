@@ -216,9 +216,9 @@ def forked_probe(monkeypatch):
     """The process of a probe is forked from one that has loaded torch."""
     import multiprocessing
 
-    from forks import CONTEXT
+    from forks import Probing
 
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method: CONTEXT)
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method: Probing)
 
 
 @pytest.fixture

@@ -38,6 +38,24 @@ def _command(words: list[str], log: Path, given: dict[str, str], before: Callabl
     sys.exit(main(words))
 
 
+class Probing:
+    """What `probe` asks of a context of `multiprocessing`: its process has the environment of its parent at its start.
+
+    A forked process would have that in which the first one of all was started, in some other test.
+    """
+
+    Pipe = staticmethod(CONTEXT.Pipe)
+
+    @staticmethod
+    def Process(target: Callable[..., None], args: tuple, daemon: bool) -> BaseProcess:
+        return CONTEXT.Process(target=_within, args=(dict(os.environ), target, args), daemon=daemon)
+
+
+def _within(given: dict[str, str], target: Callable[..., None], args: tuple) -> None:
+    _surroundings(given)
+    target(*args)
+
+
 class Forked:
     """What `Pool` asks of `subprocess.Popen`, of a process of Python; that it is forked from is its driver."""
 
@@ -80,8 +98,12 @@ def _prepare(given: dict[str, str], log: Path, threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
-    os.environ.clear()
-    os.environ.update(given)
+    _surroundings(given)
     with open(log, "ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+
+
+def _surroundings(given: dict[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(given)
