@@ -59,6 +59,8 @@ def test_a_textured_mesh_lies_in_the_coordinates_of_the_data_set(tmp_path, case)
         browser = Browser(page.url)
         shown = browser.wait_for(lambda b: b.names().get("/mesh"))
         assert bytes(shown["glb_data"]) == path.read_bytes()
+        placed = {"SetOrientationMessage", "SetPositionMessage"}
+        browser.wait_for(lambda b: placed <= {row["type"] for row in b.told if row.get("name") == "/mesh"})
         pose = {row["type"]: row for row in browser.told if row.get("name") == "/mesh"}
         wxyz = np.array(pose["SetOrientationMessage"]["wxyz"])
         turn = needs("viser.transforms").SO3(wxyz).as_matrix()
