@@ -336,6 +336,7 @@ def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcom
         "steps": scaled(plan.table.base, plan.table, plan.steps).length or 0,
         "max_points": plan.max_points,
         "columns": list(plan.columns),
+        "also": list(plan.table.columns),
         "seeds": plan.seeds,
         "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},
         "stages": shared_stages([trial for trial in every if trial.folder in outcomes]),

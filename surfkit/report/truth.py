@@ -64,10 +64,11 @@ class Truth:
 
         What `surfkit evaluate` has measured with other settings, or in another volume, is not that.
         """
-        geometry = (metrics.get("compressed") or {} if compressed else metrics).get("geometry") or {}
+        own = metrics.get("compressed") or {} if compressed else metrics
+        geometry = own.get("geometry") or {}
         made = geometry.get("table")
         is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
-        return geometry.get("truth") == str(self.path) and is_same
+        return geometry.get("truth") == str(self.path) and is_same and "mesh" in own  # older versions have none
 
     def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
@@ -91,10 +92,10 @@ class Truth:
         settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
         files = (shown.mesh, self.path)
         found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)
-        found["table"] = {"tau": self.tau, "truth": self.stamp}
+        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
         if not crop.exists():
             write_json(crop, read_json(shown.out / "geometry" / "crop.json", Any))
-        metrics = note_metrics(shown.metrics, {"geometry": found})
+        metrics = note_metrics(shown.metrics, found)
         return metrics if shown is run else note_compressed(run, metrics)
 
 

@@ -283,7 +283,8 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
             raise BadInput("nowhere near")
         calls.append(settings.crop)
         write_json(out / "crop.json", {})
-        return {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
+        found = {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
+        return {"geometry": found, "mesh": {"components": len(calls)}}
 
     monkeypatch.setattr(truth, "opened", Opened)
     monkeypatch.setattr(truth, "read_unchanged", lambda run: read(run.data))
@@ -400,12 +401,14 @@ def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):
 
     def metrics(truth):
         return {
-            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}}
+            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}},
+            "mesh": {},
         }
 
     assert given.known(metrics(given)) and automatic.known(metrics(automatic))
     assert not automatic.known(metrics(given)), "the threshold was given, and is now that of the spacing"
     assert not given.known({"geometry": {"f1": 0.9, "truth": str(file), "tau": 0.5, "align": "rigid"}}), "by evaluate"
+    assert not given.known({"geometry": metrics(given)["geometry"]}), "by an older version, without the mesh by itself"
     before, crop = metrics(given), given.crop(tmp_path)
     file.write_text("another truth")
     assert not given.known(before) and given.crop(tmp_path) != crop
