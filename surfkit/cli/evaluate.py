@@ -134,9 +134,7 @@ class Evaluate:
         scene = self._scene(None)
         found = mesh_alone(read_surface(self.target), scene)
         if not found:
-            raise BadInput(
-                f"{self.target}: a cloud of points, which nothing is measured of by itself; name the truth with --gt"
-            )
+            raise BadInput(f"{self.target}: a cloud of points, not a mesh; to measure it, name the truth with --gt")
         note_metrics(out / "metrics.json", found)
         print_table(("mesh", "value"), quality_rows(found["mesh"]))
 

@@ -306,9 +306,9 @@ def _angles(found: dict[str, Any]) -> str:
 def quality_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     """What metrics.json says of a mesh by itself, for people."""
     unit, crossing, rough = found["unit"], found["crossing"], found["roughness"]
-    part = (
-        "all triangles" if crossing["boxes"] is None else f"{crossing['boxes']} cubes of {crossing['side']:.3g} {unit}"
-    )
+    part = "all triangles"
+    if crossing["boxes"] is not None:
+        part = f"those in {crossing['boxes']} cubes of {crossing['side']:.3g} {unit}"
     share = "-" if crossing["share"] is None else f"{crossing['share']:.3%}"
     planes = "not measured: no part of it is a plane"
     if rough["on_planes"] is not None:

@@ -220,8 +220,8 @@ def test_a_mesh_by_itself(tmp_path, capsys):
     after = json.loads((tmp_path / "ridges-geometry" / "metrics.json").read_text())
     slope = np.degrees(np.arctan(0.2))
     assert after["mesh"]["triangles"] == 160 and after["geometry"]["f1"] > 0.99
-    assert after["geometry"]["normals"]["median"] == pytest.approx(slope, abs=1e-6)
-    assert after["geometry"]["normals"]["p90"] == pytest.approx(slope, abs=1e-6)
+    assert after["geometry"]["normals"]["median"] == pytest.approx(slope, abs=1e-4)
+    assert after["geometry"]["normals"]["p90"] == pytest.approx(slope, abs=1e-4)
     assert after["geometry"]["roughness"]["on_truth_planes"] is None  # tau is too wide for the ball of 2 cm
     assert "half of them within 11.3 degrees" in said and "non-manifold edges" in said
 
