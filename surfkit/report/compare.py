@@ -88,10 +88,11 @@ def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list
         measured: Numbers of each finished run, by label and seed.
     """
     below, rows = built_on(table), {row.label: row for row in table.rows}
-    return [_compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
+    return [compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
 
 
-def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
+def compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
+    """Plain data of a row with the number `at`, against the row that it is built on, if any."""
     here = measured.get(row.label, {})
     there = measured.get(base.label, {}) if base else {}
     columns = {name: [run[name] for run in here.values()] for name in _known(here.values())}

@@ -145,6 +145,7 @@ def names_of_row(report: Mapping[str, Any], at: int) -> list[str]:
     row = rows[at]
     numbers = {other["label"]: str(other["number"]) for other in rows}
     states = ["failed" if e["rows"][at]["failed"] else f"{len(e['rows'][at]['runs'])}/{seeds}" for e in entries]
+    states = ["file" if row.get("file") and s != "failed" else s for s in states]
     states = ["blank" if e["rows"][at].get("not_as_named") else s for e, s in zip(entries, states, strict=True)]
     label = f"({row['label']})" if row["given_up"] else row["label"]
     return [str(row["number"]), label, numbers.get(row["built_on"], ""), ", ".join(states)]

@@ -18,6 +18,7 @@ from surfkit.raster.select import Device
 from surfkit.run.folder import Run, note_metrics
 from surfkit.run.measure import note_compressed
 from surfkit.run.resume import read_unchanged
+from surfkit.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,29 @@ class Truth:
         shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
         if not shown.mesh_record.exists():
             raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
-        crop, scene = self.crop(out), read_unchanged(run)
-        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
-        files = (shown.mesh, self.path)
-        found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)
-        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
-        if not crop.exists():
-            write_json(crop, read_json(shown.out / "geometry" / "crop.json", Any))
+        found = self.compare(shown.mesh, shown.out / "geometry", out, read_unchanged(run))
         metrics = note_metrics(shown.metrics, found)
         return metrics if shown is run else note_compressed(run, metrics)
+
+    def compare(self, mesh: Path, folder: Path, out: Path, scene: Scene) -> dict[str, Any]:
+        """What metrics.json is to say of a mesh in the frame of a scene, against this, in the volume of the table.
+
+        Args:
+            mesh: The file.
+            folder: Gets pictures and clouds.
+            out: Of the table.
+            scene: Whose views decide the volume, if none is kept yet.
+
+        Raises:
+            BadInput: The mesh is nowhere near the truth.
+        """
+        crop = self.crop(out)
+        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
+        found = measure_geometry((mesh, self.path), settings, folder, scene.train, scene.frame)
+        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
+        if not crop.exists():
+            write_json(crop, read_json(folder / "crop.json", Any))
+        return found
 
 
 def mesh_of_compressed(run: Run, device: Device) -> Run:
