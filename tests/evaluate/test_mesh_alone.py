@@ -71,8 +71,8 @@ def test_edges_of_a_sphere_and_a_disc():
     assert (found.edges, found.boundary_edges, found.non_manifold_edges) == (len(sphere.edges_unique), 0, 0)
     found = connections(whole(open_disc))
     assert (found.edges, found.boundary_edges, found.components) == (48, 24, 1)
-    rim = boundary_edges(whole(open_disc))
-    assert len(rim) == 24 and (rim > 0).all()  # none is a spoke
+    rim, edges = boundary_edges(whole(open_disc))
+    assert len(rim) == 24 and (rim > 0).all() and edges == 48  # none is a spoke
     both = connections(whole(trimesh.util.concatenate([sphere, open_disc])))
     assert both.components == 2 and both.boundary_edges == 24
 

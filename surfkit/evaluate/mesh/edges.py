@@ -44,8 +44,8 @@ def connections(mesh: WholeMesh) -> Connections:
     return Connections(len(ends), boundary, non_manifold, _components(ends, mesh.faces))
 
 
-def boundary_edges(mesh: WholeMesh) -> np.ndarray:
-    """(E, 2) int64 vertices of the edges that have one triangle.
+def boundary_edges(mesh: WholeMesh) -> tuple[np.ndarray, int]:
+    """(E, 2) int64 vertices of the edges that have one triangle, and the number of all edges.
 
     Args:
         mesh: Any.
@@ -53,7 +53,7 @@ def boundary_edges(mesh: WholeMesh) -> np.ndarray:
     ends = sorted_sides(mesh.faces)
     differs = np.concatenate([[True], ends[1:] != ends[:-1], [True]])
     rim = ends[differs[:-1] & differs[1:]]
-    return np.stack([rim >> 32, rim & 0xFFFFFFFF], axis=1)
+    return np.stack([rim >> 32, rim & 0xFFFFFFFF], axis=1), int(differs[1:].sum())
 
 
 def sorted_sides(faces: np.ndarray) -> np.ndarray:
