@@ -11,7 +11,7 @@ from surfkit.evaluate.geometry.normals import normals_at
 from surfkit.evaluate.geometry.repetition import LEAST
 from surfkit.evaluate.geometry.scores import nearest_rows, tree
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.mesh.roughness import Roughness, residuals, root_mean_square
+from surfkit.evaluate.mesh.roughness import Roughness, median_of, residuals
 
 MOST = 200_000
 """Points at which normals are compared."""
@@ -63,5 +63,5 @@ def roughness_on_truth(outcome: Outcome, rough: Roughness, unit: float = 1.0) ->
     near = tree(first.truth).query(places, distance_upper_bound=radius / 2)[0] < np.inf
     even = np.flatnonzero(near)
     even = even[residuals(first.truth, places[even], radius) <= EVEN * radius]
-    value = root_mean_square(rough.values[even]) if len(even) >= LEAST else None
+    value = median_of(rough.values[even]) if len(even) >= LEAST else None
     return {"on_truth_planes": value and value * unit, "places": len(even), "radius": rough.radius * unit}

@@ -12,6 +12,8 @@ from surfkit.evaluate.mesh.whole import WholeMesh
 
 MOST = 1 << 20
 """Cubes along an axis, so that the number of a cube fits 64 bits."""
+GOLDEN = 0.6180339887498949
+"""The golden section, multiples of which spread most evenly between whole numbers."""
 PARTS = 4
 """Into which the side of a cube is cut where vertices near it are looked for."""
 PRIMES = np.array([73856093, 19349663, 83492791])
@@ -60,14 +62,20 @@ def boxes(mesh: WholeMesh, side: float, chosen: np.ndarray, margin: float = 0.0)
 
 
 def by_number(mesh: WholeMesh, count: int) -> np.ndarray:
-    """(K,) faces at even steps of their numbers: parts of the mesh have a share in them as in its triangles."""
-    return ((np.arange(count) + 0.5) * (len(mesh.faces) / count)).astype(np.int64)
+    """(K,) faces, one from each of K equal runs of them: parts of the mesh have a share in them as in its triangles."""
+    return (_steps(count) * len(mesh.faces)).astype(np.int64)
 
 
 def by_area(mesh: WholeMesh, count: int) -> np.ndarray:
-    """(K,) faces at even steps of area in the order of the file: parts have a share in them as in its area."""
+    """(K,) faces, one from each of K runs of equal area: parts have a share in them as in its area."""
     ends = np.cumsum(mesh.areas, dtype=np.float64)
-    return np.searchsorted(ends, (np.arange(count) + 0.5) * (ends[-1] / count)).clip(max=len(ends) - 1)
+    return np.searchsorted(ends, _steps(count) * ends[-1]).clip(max=len(ends) - 1)
+
+
+def _steps(count: int) -> np.ndarray:
+    """(K,) numbers from 0 to 1, one in each K-th, elsewhere within each: files have rows, which even steps keep to."""
+    at = np.arange(count)
+    return (at + at * GOLDEN % 1) / count
 
 
 def _touching(mesh: WholeMesh, low: np.ndarray, high: np.ndarray, near: tuple[np.ndarray, float]) -> list[np.ndarray]:

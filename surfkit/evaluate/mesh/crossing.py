@@ -17,6 +17,8 @@ BOXES = 48
 """Cubes that are measured of a larger one."""
 IN_BOX = 10_000
 """Triangles in a cube that one sheet of surface goes straight through."""
+LEAST = 0.01
+"""Of the mean area of a triangle, by which the median counts at least: slivers may be more than half."""
 PAIRS = 1 << 20
 """Pairs of triangles in memory at a time."""
 CELLS = 1 << 20
@@ -57,7 +59,7 @@ def crossings(mesh: WholeMesh) -> Crossings:
     if total <= WHOLE:
         crossing = int(crossing_faces(mesh, np.arange(total)).sum())
         return Crossings(crossing / total, crossing, total)
-    side = float(np.sqrt(IN_BOX * mesh.area / total))
+    side = float(np.sqrt(IN_BOX * max(np.median(mesh.areas), mesh.area / total * LEAST)))
     crossing, measured, chosen = [], [], []
     for box in boxes(mesh, side, by_number(mesh, BOXES)):
         within = box.has(mesh.corners(box.faces)).all(1)

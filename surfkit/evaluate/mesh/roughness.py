@@ -52,8 +52,8 @@ class Roughness:
 
     @property
     def on_planes(self) -> float | None:
-        """Root of the mean square over the places on planes; None without any."""
-        return root_mean_square(self.values[self.is_plane])
+        """Median over the places on planes, of which some reach a little over an edge; None without any."""
+        return median_of(self.values[self.is_plane])
 
     @property
     def is_plane(self) -> np.ndarray:
@@ -61,9 +61,9 @@ class Roughness:
         return self.values <= PLANE * self.radius
 
 
-def root_mean_square(values: np.ndarray) -> float | None:
+def median_of(values: np.ndarray) -> float | None:
     """Of some values; None without any."""
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+    return float(np.median(values)) if len(values) else None
 
 
 def radius_for(mesh: WholeMesh, metres: float | None) -> float:
