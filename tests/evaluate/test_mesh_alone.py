@@ -8,7 +8,7 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.evaluate.mesh import boxes as cubes
 from surfkit.evaluate.mesh import crossing, roughness
 from surfkit.evaluate.mesh.boxes import boxes
@@ -24,7 +24,7 @@ open3d = needs("open3d")
 
 
 def surface(mesh, offset=(0.0, 0.0, 0.0), kind=np.float64):
-    return Surface(Path("mesh.ply"), np.array(mesh.vertices, kind), np.array(mesh.faces, np.int32), offset)
+    return Surface(Path("mesh.obj"), np.array(mesh.vertices, kind), np.array(mesh.faces, np.int32), offset)
 
 
 def whole(mesh):
@@ -105,7 +105,7 @@ def test_faces_without_area():
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]], [[0, 1, 2], [0, 1, 3]], process=False)
     assert measure_mesh(surface(flat)).figures["degenerate"] == 1
     with pytest.raises(BadInput, match="no area"):
-        whole_mesh(Surface(Path("mesh.ply"), np.zeros((3, 3)), np.array([[0, 1, 2]])))
+        whole_mesh(Surface(Path("mesh.obj"), np.zeros((3, 3)), np.array([[0, 1, 2]])))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -189,7 +189,7 @@ def test_residuals_are_those_of_a_fit():
 def test_radius():
     """A metre where metres are known; else the same for meshes of about the same size."""
     small, large = (whole(terrain(side, 1.0)) for side in (300, 320))
-    assert radius_for(small, None) == radius_for(large, None) == 1.0
+    assert radius_for(small, None) == radius_for(large, None) == 2.0
     assert radius_for(small, 0.3048) == pytest.approx(1 / 0.3048)
 
 
@@ -208,3 +208,19 @@ def test_figures_in_metres():
     assert one.figures["boundary_share"] == 4 * 120 / len(metres.edges_unique)
     assert json.loads(json.dumps(one.figures, allow_nan=False)) == one.figures
     assert measure_mesh(surface(metres)).figures["unit"] == "unit"
+
+
+def test_the_unit_that_a_file_says(tmp_path):
+    path = tmp_path / "mesh.ply"
+    terrain(20).export(path)
+    whole_file = path.read_bytes()
+    assert measure_mesh(read_surface(path)).figures["unit"] == "unit"
+    path.write_bytes(whole_file.replace(b"element vertex", b"comment metres per unit: 0.5\nelement vertex"))
+    found = measure_mesh(read_surface(path)).figures
+    assert found["unit"] == "m" and found["area"] == pytest.approx(2.0**2 / 4)
+    assert measure_mesh(read_surface(path), 1.0).figures["area"] == pytest.approx(2.0**2), (
+        "who knows better is believed"
+    )
+    path.write_bytes(whole_file.replace(b"element vertex", b"comment metres per unit: x\nelement vertex"))
+    with pytest.raises(BadInput, match="metres per unit: x: it must be a number above 0"):
+        measure_mesh(read_surface(path))

@@ -74,7 +74,7 @@ def measure_geometry(
     found = figures(outcome, settings) | {"reconstruction": str(files[0]), "truth": str(files[1])}
     if alone is not None:
         found["normals"] = normal_angles(outcome, np.random.default_rng(settings.seed))
-        found["roughness"] = roughness_on_truth(outcome, alone.roughness, metres or 1.0)
+        found["roughness"] = roughness_on_truth(outcome, alone.roughness, alone.metres or 1.0)
     for left in (*out.glob("view[0-9].png"), *out.glob("class-*.png")):  # of an earlier comparison
         left.unlink()
     write_files(out, outcome, settings)

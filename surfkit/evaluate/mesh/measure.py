@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import Surface, metres_in
 from surfkit.evaluate.mesh.crossing import crossings
 from surfkit.evaluate.mesh.edges import connections
 from surfkit.evaluate.mesh.roughness import Roughness, radius_for, roughness
@@ -22,10 +22,12 @@ class MeshMeasure:
     Attributes:
         figures: Plain data; lengths and areas are in `figures["unit"]`, "m" or "unit".
         roughness: Units of the mesh, places with the offset of the file.
+        metres: Length of a unit of the mesh; None where nobody knows.
     """
 
     figures: dict[str, Any]
     roughness: Roughness
+    metres: float | None
 
 
 def measure_mesh(mesh: Surface, metres: float | None = None) -> MeshMeasure:
@@ -33,12 +35,13 @@ def measure_mesh(mesh: Surface, metres: float | None = None) -> MeshMeasure:
 
     Args:
         mesh: With faces.
-        metres: Length of its unit; None where nobody knows.
+        metres: Length of its unit; None for what its file says, if it does.
 
     Raises:
-        BadInput: It has no surface.
+        BadInput: It has no surface, or its file says something odd of its unit.
     """
-    began, unit = time.process_time(), metres or 1.0
+    began, metres = time.process_time(), metres or metres_in(mesh.path)
+    unit = metres or 1.0
     whole = whole_mesh(mesh)
     edges, rough = connections(whole), roughness(whole, radius_for(whole, metres))
     found = crossings(whole)
@@ -61,4 +64,4 @@ def measure_mesh(mesh: Surface, metres: float | None = None) -> MeshMeasure:
         },
         "cpu_seconds": round(time.process_time() - began, 2),
     }
-    return MeshMeasure(figures, Roughness(rough.radius, rough.places + np.array(mesh.offset), rough.values))
+    return MeshMeasure(figures, Roughness(rough.radius, rough.places + np.array(mesh.offset), rough.values), metres)

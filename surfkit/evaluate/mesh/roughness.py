@@ -21,7 +21,7 @@ from surfkit.evaluate.mesh.whole import WholeMesh
 
 RADIUS_M = 1.0
 """Of the balls, where the length of a unit is known: of planes of buildings there is much, of details little."""
-SHARE = 1 / 300
+SHARE = 1 / 200
 """Radius where it is not, as a share of the square root of the area of the mesh."""
 BOXES, SIDE = 64, 6.0
 """Cubes that are measured, and the side of one in radii."""
