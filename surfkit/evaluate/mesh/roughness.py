@@ -23,12 +23,12 @@ RADIUS_M = 1.0
 """Of the balls, where the length of a unit is known: of planes of buildings there is much, of details little."""
 SHARE = 1 / 200
 """Radius where it is not, as a share of the square root of the area of the mesh."""
-BOXES, SIDE = 64, 6.0
+BOXES, SIDE = 128, 6.0
 """Cubes that are measured, and the side of one in radii."""
 IN_BALL = 64
 """Points in a ball that one plane goes through the middle of."""
-PLACES, MOST = 128, 200_000
-"""In a cube: places at which roughness is measured, and points of the surface."""
+PLACES, MOST = 64, 200_000
+"""In a cube: places at which roughness is measured, each time that it was chosen, and points of the surface."""
 LEAST = 10
 """Points in a ball, without which nothing is measured."""
 PLANE = 0.1
@@ -103,7 +103,7 @@ def _in_box(mesh: WholeMesh, box: Box, radius: float, draw: np.random.Generator)
     count = min(math.ceil(area * IN_BALL / (math.pi * radius**2)), MOST)
     points = sample_surface(part, count, draw)
     inner = points[box.has(points)]
-    places = inner[:: max(1, len(inner) // PLACES)]
+    places = inner[:: max(1, len(inner) // (PLACES * box.chosen))]
     values = residuals(points, places, radius)
     known = np.isfinite(values)
     return places[known], values[known]
