@@ -21,6 +21,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
 from surfkit.report.ablation import Table
 from surfkit.report.notes import lines_on_depth, row_numbers
+from surfkit.report.others import OtherMesh
 from surfkit.report.rows import Trial
 from surfkit.report.screen import Screen
 from surfkit.report.sharing import sharing_lines
@@ -68,12 +69,19 @@ class Ablate:
     """With --gt: distance threshold below which a point counts as correct, in units of the ground truth; one for each
     data set, or one for all. Required when the ground truth is a mesh."""
 
+    meshes: tuple[str, ...] = ()
+    """With --gt: meshes that other programs made of the same photographs, in the frame of the data set, each as
+    LABEL=FILE, such as OpenMVS=scene_mesh.ply. They are measured as those of the rows are, in the same crop volume, and
+    stand below them."""
+
     rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
     """Run only these rows, by number or label; finished results of the other rows are shown, too."""
 
     columns: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all that were measured)")] = ()
-    """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, points, seconds, cpu_seconds,
-    bytes, peak_memory_bytes, peak_gpu_bytes, fps. lpips is measured only if it is named."""
+    """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, normals_median, normals_p90,
+    roughness_on_truth, roughness, boundary_share, components, non_manifold_edges, crossing_share, triangles,
+    triangles_per_area, points, seconds, cpu_seconds, bytes, peak_memory_bytes, peak_gpu_bytes, fps. lpips is measured
+    only if it is named, and what describes a mesh only with --gt."""
 
     show: bool = False
     """Run nothing, and write nothing: show what is finished."""
@@ -115,6 +123,7 @@ class Ablate:
             self.columns,
             self.executor,
             self.shared,
+            tuple(map(OtherMesh.parsed, self.meshes)),
         )
         if self.show:
             show(report_so_far(plan))

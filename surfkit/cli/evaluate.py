@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.cli.result import show, show_geometry, show_levels
-from surfkit.cli.table import tell
+from surfkit.cli.result import quality_rows, show, show_geometry, show_levels
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
@@ -18,6 +18,7 @@ from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.mesh.measure import measure_mesh
 from surfkit.method.base import Reconstruction
 from surfkit.pipeline import loaded, opened
 from surfkit.raster.select import Device
@@ -29,7 +30,7 @@ from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
 from surfkit.run.lod import load_levels, measure_levels
 from surfkit.run.measure import evaluate, note_compressed
-from surfkit.run.method import refuse_not_drawn, splats_of
+from surfkit.run.method import is_drawn, refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.run.resume import read_unchanged
 from surfkit.run.warn import NONE_HELD_OUT
@@ -43,14 +44,17 @@ class Evaluate:
     """Measure a finished run on its held-out photographs, or with --gt its mesh against ground truth.
 
     Without --gt: computes PSNR, SSIM and LPIPS, and writes metrics.json and the pictures again. With --gt: computes
-    precision, recall, F1 and chamfer distances of RUN/mesh.ply, or of any mesh or point cloud that is given instead of
-    a run, for the whole surface and for each class of places. They are written to metrics.json; the crop volume, the
-    points coloured by error and the pictures are written to the folder geometry/ beside it. --seen and --seams also
-    measure parts of the photographs; --seams also measures parts of the geometry. --lod also measures levels of detail.
+    precision, recall, F1, chamfer distances and angles between normals of RUN/mesh.ply, or of any mesh or point cloud
+    that is given instead of a run, for the whole surface and for each class of places. They are written to
+    metrics.json; the crop volume, the points coloured by error and the pictures are written to the folder geometry/
+    beside it. With and without --gt, a mesh is also measured by itself: edges with one triangle, loose parts, edges
+    with more than two triangles, triangles that cross others, triangles per area, and roughness on planes. --seen and
+    --seams also measure parts of the photographs; --seams also measures parts of the geometry. --lod also measures
+    levels of detail.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
-    """Run folder that `surfkit train` made, or a mesh or point cloud to compare with --gt."""
+    """Run folder that `surfkit train` made; or a mesh, or with --gt also a point cloud."""
 
     gt: Path | None = None
     """Ground truth: a point cloud or a mesh. PLY, LAS and LAZ of any size; E57; OBJ, STL, GLB and OFF; or a raster of
@@ -107,17 +111,43 @@ class Evaluate:
                 if self.lod:
                     raise BadInput("--lod is for photographs, and --gt for geometry: leave out one of the two")
                 return self._geometry(self.gt, zones)
-            if (self.views, self.out, self.geometry) != (None, None, Comparison()):
-                raise BadInput("--views, --out and the options of the comparison have no effect without --gt; add --gt")
+            if self.geometry != Comparison():
+                raise BadInput("the options of the comparison have no effect without --gt; add --gt")
             if self.target.is_file():
-                raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
+                return self._file(zones)
+            if (self.views, self.out) != (None, None):
+                raise BadInput("--views and --out have no effect without --gt on a run; add --gt, or leave them out")
             refuse_no_run(self.target)
             with locked(self.target), full_disk_in_one_line(self.target):
                 with loaded(self.target, self.device, self.compressed) as (ctx, made):
                     self._photographs(ctx, made, zones)
 
+    def _file(self, zones: Zones) -> None:
+        """Measure the mesh of a file by itself."""
+        if self.lod or zones != Zones() or self.lpips_weights != "auto" or self.device != "auto":
+            raise BadInput(
+                f"{self.target}: a file; --lod, --seen, --seams, --lpips-weights and --device are for runs; leave them "
+                "out"
+            )
+        out = self._beside()
+        refuse_unwritable(out)
+        scene = self._scene(None)
+        found = mesh_alone(read_surface(self.target), scene)
+        if not found:
+            raise BadInput(f"{self.target}: a cloud of points, not a mesh; to measure it, name the truth with --gt")
+        note_metrics(out / "metrics.json", found)
+        print_table(("mesh", "value"), quality_rows(found["mesh"]))
+
+    def _beside(self) -> Path:
+        """Where the figures of a file go."""
+        return self.out or self.target.with_name(f"{self.target.stem}-geometry")
+
     def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
         run, scene = ctx.run, ctx.scene
+        surface = read_surface(run.mesh) if run.mesh_record.exists() and run.mesh.exists() else None
+        if surface is not None and not self.lod and zones == Zones() and not is_drawn(run):
+            metrics = note_metrics(run.metrics, mesh_alone(surface, scene))
+            return print_table(("mesh", "value"), quality_rows(metrics["mesh"]))
         refuse_not_drawn(run)
         zones.refuse_too_many(scene)
         if not scene.held_out:
@@ -125,6 +155,8 @@ class Evaluate:
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         tree = load_levels(run, splats_of(run, made)) if self.lod else None
         metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)
+        if surface is not None:
+            metrics = note_metrics(run.metrics, mesh_alone(surface, scene))
         if zones != Zones():
             found = measure_zones(scene, made.draw, zones, rendered_depths(made.draw), seams)
             metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
@@ -160,7 +192,7 @@ class Evaluate:
             refuse_no_mesh(shown)
             if zones != Zones():
                 refuse_not_drawn(run)
-        out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else shown.out)
+        out = self._beside() if run is None else self.out or shown.out
         refuse_unwritable(out / "geometry")
         scene = self._scene(run)
         if scene is not None:
@@ -169,7 +201,7 @@ class Evaluate:
         if surface is not None and surface.faces is None:
             raise BadInput(f"{truth}: a cloud of points; --seen needs a mesh, or leave --gt out to use rendered depth")
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
-        found = measure_geometry(
+        measured = measure_geometry(
             (self.target if run is None else shown.mesh, truth),
             self.geometry,
             out / "geometry",
@@ -177,14 +209,15 @@ class Evaluate:
             scene.frame if scene else None,
             seams,
         )
-        metrics, images = note_metrics(out / "metrics.json", {"geometry": found}), {}
+        found = measured["geometry"]
+        metrics, images = note_metrics(out / "metrics.json", measured), {}
         if zones != Zones() and scene.held_out:
             images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
             before = metrics.get("images")
             note_metrics(out / "metrics.json", {"images": (before if isinstance(before, dict) else {}) | images})
         if self.compressed:
             note_compressed(run, metrics)
-        show_geometry(out, found, images)
+        show_geometry(out, measured, images)
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
@@ -206,6 +239,12 @@ class Evaluate:
         if (self.views / "run.json").exists():
             return read_unchanged(opened(self.views))
         return read(Data(self.views))
+
+
+def mesh_alone(surface: Surface, scene: Scene | None) -> dict[str, Any]:
+    """What metrics.json is to say of a mesh by itself; nothing of a cloud."""
+    metres = None if scene is None else scene.frame.metres
+    return {} if surface.faces is None else {"mesh": measure_mesh(surface, metres).figures}
 
 
 def refuse_no_mesh(run: Run) -> None:

@@ -21,6 +21,9 @@ LPIPS = {
 }
 """Names in metrics.json, and on the screen."""
 
+UNITS = {"m": "metre", "unit": "unit"}
+"""Of lengths of a mesh in metrics.json."""
+
 
 def show(run: Run, metrics: dict[str, Any]) -> None:
     """Print a table of the metrics, and the paths of what was written.
@@ -34,6 +37,9 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
         remedy = "delete that part of it, and measure again with surfkit evaluate --gt"
         with refuse_damaged(run.metrics, f"geometry is damaged; {remedy}"):
             rows += geometry_rows(metrics["geometry"])
+    if "mesh" in metrics:
+        with refuse_damaged(run.metrics, "mesh is damaged; delete that part of it, and give surfkit evaluate again"):
+            rows += quality_rows(metrics["mesh"])
     print_table(("metric", "value"), rows)
     print()
     if run.mesh_record.exists():
@@ -69,15 +75,20 @@ def what_next(run: Run) -> str:
     return f"next: `{run.to_paste('view')}` shows it in a browser; {mesh}{smaller}"
 
 
-def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:
-    """Print tables of how close a surface is to the truth, in all and by class, and the paths of what was written.
+def show_geometry(out: Path, measured: dict[str, Any], images: dict[str, Any]) -> None:
+    """Print tables of how close a surface is to the truth, in all and by class, of the mesh by itself, and the paths of
+    what was written.
 
     Args:
         out: Folder of metrics.json.
-        found: What it says of the geometry.
+        measured: What it says of the geometry, and of the mesh if it is one.
         images: Figures of parts of held-out photographs that were measured with it.
     """
+    found = measured["geometry"]
     print_table(("geometry", "value"), [*geometry_rows(found), *zone_rows(images)])
+    if "mesh" in measured:
+        print()
+        print_table(("mesh", "value"), quality_rows(measured["mesh"]))
     print()
     if "classes" in found:
         print_table(("class", "P", "R", "F1", "truth"), class_rows(found["classes"]))
@@ -277,5 +288,37 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         values = [found[name][part] for part in ("accuracy", "completeness", "overall")]
         texts = ["-" if value is None else f"{value:.3g}" for value in values]
         rows.append((label, f"{texts[0]} accuracy, {texts[1]} completeness, {texts[2]} overall"))
+    if angles := found.get("normals"):  # of a mesh; not in metrics of older versions
+        rows.append(("normals", _angles(angles)))
+    if (rough := found.get("roughness")) and rough["on_truth_planes"] is not None:
+        where = f"at {rough['places']:,} places where the truth is plane"
+        rows.append(("roughness", f"{rough['on_truth_planes']:.3g}, {where}"))
     counts = found["points"]
     return [*rows, ("points compared", f"{counts['reconstruction']:,} with {counts['truth']:,} of the truth")]
+
+
+def _angles(found: dict[str, Any]) -> str:
+    if found["median"] is None:
+        return f"not measured: {found['points']} points are right"
+    return f"half of them within {found['median']:.1f} degrees of those of the truth, 90 % within {found['p90']:.1f}"
+
+
+def quality_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """What metrics.json says of a mesh by itself, for people."""
+    unit, crossing, rough = found["unit"], found["crossing"], found["roughness"]
+    part = "all triangles"
+    if crossing["boxes"] is not None:
+        part = f"those in {crossing['boxes']} cubes of {crossing['side']:.3g} {unit}"
+    share = "-" if crossing["share"] is None else f"{crossing['share']:.3%}"
+    planes = "not measured: no part of it is a plane"
+    if rough["on_planes"] is not None:
+        size = f"in balls of {rough['radius']:.3g} {unit}"
+        planes = f"{rough['on_planes']:.3g} {unit} {size}; {rough['planes']:.0%} of the area is planes"
+    return [
+        ("triangles", f"{found['triangles']:,}, {found['triangles_per_area']:,.4g} per square {UNITS[unit]}"),
+        ("boundary edges", f"{found['boundary_share']:.2%} of {found['edges']:,}"),
+        ("connected parts", f"{found['components']:,}"),
+        ("non-manifold edges", f"{found['non_manifold_edges']:,}"),
+        ("crossing triangles", f"{share} of {crossing['measured']:,}: {part}"),
+        ("roughness on planes", planes),
+    ]

@@ -11,10 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.holes import areas_of, close_holes
-from surfkit.scene.sets import is_among
-
-HASH = np.uint64(0x9E3779B97F4A7C15)
-"""An odd number whose product scatters the bits of a coordinate."""
+from surfkit.scene.same_places import first_in_place
 
 
 @dataclass(frozen=True)
@@ -179,15 +176,5 @@ def _referenced(mesh: Mesh) -> Mesh:
 
 def _welded(mesh: Mesh) -> Mesh:
     """The mesh with vertices in the same place made one; the first of them gives the colour."""
-    places = np.ascontiguousarray(mesh.vertices + np.float32(0))  # -0 becomes 0
-    # Only those whose hashes are not their own are compared: sorting all places takes twice as long.
-    x, y, z = places.view(np.uint32).T.astype(np.uint64)
-    hashes = (x * HASH ^ y) * HASH ^ z
-    ranked = np.sort(hashes)
-    alike = np.flatnonzero(is_among(hashes, np.unique(ranked[1:][ranked[1:] == ranked[:-1]])))
-    _, first, at = np.unique(places[alike].view(np.void(12).dtype)[:, 0], return_index=True, return_inverse=True)
-    if len(first) == len(alike):
-        return mesh
-    stands_for = np.arange(len(places), dtype=np.int32)
-    stands_for[alike] = alike[first][at]
-    return _referenced(replace(mesh, faces=stands_for[mesh.faces]))
+    stands_for = first_in_place(mesh.vertices)
+    return mesh if stands_for is None else _referenced(replace(mesh, faces=stands_for[mesh.faces]))

@@ -35,6 +35,7 @@ from surfkit.recipe import Recipe
 from surfkit.recipes import RECIPES, city, surface
 from surfkit.recipes.surface import STEREO
 from surfkit.report.ablation import BASELINE, Row, Table
+from surfkit.report.columns import OF_MESH
 from surfkit.start.stereo import StereoStart
 from surfkit.train.stage import Stage
 
@@ -257,6 +258,7 @@ SURFACE = Table(
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
         Row("stereo alone", {"method": STEREO.method}, kept=False),
     ),
+    columns=OF_MESH,
 )
 
 # Figures of GauU-Scene, means of three scenes. Plugin packages add the other methods (`surfkit_rows`). Differences are

@@ -65,14 +65,19 @@ class Table:
         about: What it shows, in one line.
         base: What the first row changes.
         rows: From top to bottom.
+        columns: Names of columns that are shown where they were measured, beside those that every table shows.
     """
 
     name: str
     about: str
     base: Recipe
     rows: tuple[Row, ...]
+    columns: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in self.columns:
+            if name not in COLUMNS:
+                raise BadInput(f"table:{self.name}, columns: {unknown('column', name, COLUMNS)}")
         labels = [row.label for row in self.rows]
         if twice := [label for label in labels if labels.count(label) > 1]:
             raise BadInput(f"table:{self.name} has two rows {twice[0]!r}; each needs a label of its own")

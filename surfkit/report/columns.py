@@ -25,7 +25,7 @@ class Column:
         unit: Of the number; "B" and "" of `scaled` ones get a prefix.
         scaled: Write large numbers as thousands, millions or billions.
         in_percent: Write differences as a share of the number that they are to.
-        by_default: Show it without being asked where it was measured.
+        by_default: Show it without being asked where it was measured; other columns are shown by tables that name them.
     """
 
     head: str
@@ -68,6 +68,16 @@ COLUMNS = {
     "precision": Column("P", 3, "higher"),
     "recall": Column("R", 3, "higher"),
     "f1": Column("F1", 3, "higher"),
+    "normals_median": Column("normals", 1, "lower", unit="deg", by_default=False),
+    "normals_p90": Column("normals 90 %", 1, "lower", unit="deg", by_default=False),
+    "roughness_on_truth": Column("rough", 3, "lower", by_default=False),
+    "roughness": Column("rough, own planes", 3, "lower", by_default=False),
+    "boundary_share": Column("boundary", 2, "lower", factor=100, unit="%", by_default=False),
+    "components": Column("parts", 0, "lower", by_default=False),
+    "non_manifold_edges": Column("non-manifold", 0, "lower", by_default=False),
+    "crossing_share": Column("crossing", 3, "lower", factor=100, unit="%", by_default=False),
+    "triangles": Column("triangles", 2, "lower", scaled=True, in_percent=True, by_default=False),
+    "triangles_per_area": Column("per area", 1, "lower", in_percent=True, by_default=False),
     "points": Column("points", 2, "lower", scaled=True, in_percent=True),
     "seconds": Column("minutes", 1, "lower", factor=1 / 60, in_percent=True),
     "cpu_seconds": Column("CPU min", 1, "lower", factor=1 / 60, in_percent=True),
@@ -79,6 +89,21 @@ COLUMNS = {
 """Every column by its name in ablation.json and on the command line, in the order of the paper's tables."""
 
 
+OF_MESH = (
+    "normals_median",
+    "normals_p90",
+    "roughness_on_truth",
+    "roughness",
+    "boundary_share",
+    "components",
+    "non_manifold_edges",
+    "crossing_share",
+    "triangles",
+    "triangles_per_area",
+)
+"""What a mesh is beside its precision, recall and F1."""
+
+
 def refuse_unknown_columns(names: Sequence[str]) -> None:
     """BadInput for a name that no column has, or that stands twice."""
     for at, name in enumerate(names):
@@ -88,14 +113,15 @@ def refuse_unknown_columns(names: Sequence[str]) -> None:
             raise BadInput(f"--columns: {name} is there twice; name each column once")
 
 
-def shown_columns(asked: Sequence[str], measured: Collection[str]) -> list[str]:
+def shown_columns(asked: Sequence[str], measured: Collection[str], also: Collection[str] = ()) -> list[str]:
     """Names of the columns of a table: those that the user asked for, or else those that were measured.
 
     Args:
         asked: By the user; none for the default.
         measured: Names of the numbers that at least one row has.
+        also: Names of columns that the table shows beside those by default.
     """
     if asked:
         return list(asked)
-    found = [name for name, column in COLUMNS.items() if column.by_default and name in measured]
+    found = [name for name, column in COLUMNS.items() if (column.by_default or name in also) and name in measured]
     return found or ["ssim", "psnr", "points"]

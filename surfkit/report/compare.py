@@ -12,6 +12,8 @@ from surfkit.core.codec import dump, load
 from surfkit.report.ablation import Row, Table, built_on
 from surfkit.report.columns import COLUMNS
 
+OF_MESH = ("triangles", "triangles_per_area", "boundary_share", "components", "non_manifold_edges")
+"""What stands in metrics.json under "mesh" by the name of its column."""
 Figures = Mapping[str, float]
 """Numbers of a run, by the names in `COLUMNS`."""
 
@@ -19,8 +21,9 @@ Figures = Mapping[str, float]
 def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, float]:
     """The numbers that are compared, out of the metrics of a run; depth maps made for it are part of its CPU time.
 
-    Precision, recall and F1 are there where its mesh was compared with the truth, PSNR and SSIM where its method draws
-    pictures, points where it makes some.
+    Precision, recall, F1 and angles between normals are there where its mesh was compared with the truth, what is known
+    of the mesh by itself where that was measured, PSNR and SSIM where its method draws pictures, points where it makes
+    some.
 
     Args:
         metrics: Of the run.
@@ -31,6 +34,7 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
     """
     images = load(dict[str, Any], metrics.get("images"), "images")
     geometry = load(dict[str, Any], metrics.get("geometry") or {}, "geometry")
+    mesh = load(dict[str, Any], metrics.get("mesh") or {}, "mesh")
     known = dict(metrics)
     if compressed:
         small = load(dict[str, Any] | None, metrics.get("compressed"), "compressed")
@@ -38,9 +42,10 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
             raise BadInput("there is no compressed model, which the recipe wants; the notes in run.json say why")
         images = load(dict[str, Any], small.get("images"), "compressed.images")
         geometry = load(dict[str, Any], small.get("geometry") or {}, "compressed.geometry")
+        mesh = load(dict[str, Any], small.get("mesh") or {}, "compressed.mesh")
         both = load(tuple[float | None, float | None] | None, small.get("fps_before_and_after"), "compressed.fps")
         known |= {"bytes": small.get("bytes"), "fps": both and both[1]}
-    known |= {name: geometry.get(name) for name in ("precision", "recall", "f1")}
+    known |= surface_figures(geometry, mesh)
     known |= {name: images.get(name) for name in ("psnr", "ssim")}
     known["lpips"] = images.get("lpips_alex")  # AlexNet, as in CityGaussianV2's released code
     needed = {"seconds", "cpu_seconds"} | (set() if "not_measured" in images else {"psnr", "ssim"})
@@ -51,6 +56,30 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
     return found | {"cpu_seconds": found["cpu_seconds"] + made}
 
 
+def surface_figures(geometry: Mapping[str, Any], mesh: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of a surface that are compared, None where they are not known.
+
+    Args:
+        geometry: What metrics.json says of a comparison with the truth; may be empty.
+        mesh: What it says of the mesh by itself; may be empty.
+
+    Raises:
+        BadInput: A part is not what it should be.
+    """
+
+    def part(found: Mapping[str, Any], name: str) -> dict[str, Any]:
+        return load(dict[str, Any], found.get(name) or {}, name)
+
+    return {
+        **{name: geometry.get(name) for name in ("precision", "recall", "f1")},
+        **{f"normals_{name}": part(geometry, "normals").get(name) for name in ("median", "p90")},
+        "roughness_on_truth": part(geometry, "roughness").get("on_truth_planes"),
+        **{name: mesh.get(name) for name in OF_MESH},
+        "crossing_share": part(mesh, "crossing").get("share"),
+        "roughness": part(mesh, "roughness").get("on_planes"),
+    }
+
+
 def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list[dict[str, Any]]:
     """Plain data of every row of the table: means, deviations and differences.
 
@@ -59,10 +88,11 @@ def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list
         measured: Numbers of each finished run, by label and seed.
     """
     below, rows = built_on(table), {row.label: row for row in table.rows}
-    return [_compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
+    return [compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
 
 
-def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
+def compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
+    """Plain data of a row with the number `at`, against the row that it is built on, if any."""
     here = measured.get(row.label, {})
     there = measured.get(base.label, {}) if base else {}
     columns = {name: [run[name] for run in here.values()] for name in _known(here.values())}

@@ -27,6 +27,7 @@ from surfkit.report.columns import refuse_unknown_columns
 from surfkit.report.compare import compare
 from surfkit.report.latex import latex
 from surfkit.report.notes import lacked_maps, notes_of
+from surfkit.report.others import OtherMesh, measured_mesh, mesh_rows, refuse_unfit
 from surfkit.report.perceptual import refuse_unmeasurable
 from surfkit.report.rows import Outcome, Trial, Work, attempt, finished, run_elsewhere
 from surfkit.report.runs_csv import comma_separated
@@ -67,6 +68,7 @@ class Plan:
         columns: Those of the written tables; what was measured if empty. LPIPS is measured only if it is named.
         workers: The executor of the rows.
         shared: Whether a stage that several rows have in common is computed once.
+        meshes: Of other programs, which are compared with the truth and stand below the rows.
     """
 
     table: Table
@@ -81,6 +83,7 @@ class Plan:
     columns: tuple[str, ...] = ()
     workers: Executor = Inline()
     shared: bool = True
+    meshes: tuple[OtherMesh, ...] = ()
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -96,6 +99,7 @@ class Plan:
                 f"--gt: {len(self.truth)} ground truths for {len(self.data)} data sets; give one for each, in the "
                 "same order"
             )
+        refuse_unfit(self.meshes, self.table, len(self.data), bool(self.truth))
 
     @property
     def sets(self) -> list[tuple[Data, Truth | None]]:
@@ -189,6 +193,10 @@ class Session:
                     self.outcomes[work.trial.folder] = outcome
                     self.save()
                     self.watch.end(work.trial, outcome, self.report)
+        for mesh in plan.meshes:
+            ((data, truth),) = plan.sets
+            self.outcomes[mesh.folder(truth, plan.out)] = measured_mesh(mesh, truth, data, plan.out)
+            self.save()
         return self.report
 
     def wave(self, waiting: Sequence[Trial]) -> list[Trial]:
@@ -297,6 +305,8 @@ def refuse_unusable(plan: Plan) -> None:
             )
         if truth is not None:
             truth.refuse_unusable()
+            for mesh in plan.meshes:
+                mesh.refuse_unusable()
         if plan.lpips:
             refuse_unmeasurable(held_out)
 
@@ -336,6 +346,7 @@ def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcom
         "steps": scaled(plan.table.base, plan.table, plan.steps).length or 0,
         "max_points": plan.max_points,
         "columns": list(plan.columns),
+        "also": list(plan.table.columns),
         "seeds": plan.seeds,
         "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},
         "stages": shared_stages([trial for trial in every if trial.folder in outcomes]),
@@ -343,7 +354,8 @@ def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcom
             {
                 "data": dump(replace(data, path=data.path.resolve())),
                 "truth": None if truth is None else {"path": str(truth.path), "tau": truth.tau},
-                "rows": rows_of(plan, [trial for trial in every if trial.data == data], outcomes),
+                "rows": rows_of(plan, [trial for trial in every if trial.data == data], outcomes)
+                + ([] if truth is None else mesh_rows(plan.meshes, truth, plan.out, outcomes, len(plan.table.rows))),
                 "notes": notes_of(trial for trial in every if trial.data == data and trial.folder in outcomes),
             }
             for data, truth in plan.sets

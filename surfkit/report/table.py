@@ -55,10 +55,11 @@ def data_name(entry: Mapping[str, Any]) -> str:
 
 
 def columns_of(report: Mapping[str, Any]) -> list[str]:
-    """Names of the columns to show: those that the user asked for, or that were measured, or else published."""
+    """Names of the columns to show: those that the user asked for, or that were measured and are shown by default or
+    by this table, or else published."""
     rows = [row for entry in data_sets(report) for row in entry["rows"]]
     measured = {name for row in rows for name in row["mean"]} or {name for row in rows for name in row["paper"]}
-    return shown_columns(report.get("columns") or (), measured)
+    return shown_columns(report.get("columns") or (), measured, report.get("also") or ())
 
 
 def published_columns(report: Mapping[str, Any], names: Sequence[str]) -> list[str]:
@@ -144,6 +145,7 @@ def names_of_row(report: Mapping[str, Any], at: int) -> list[str]:
     row = rows[at]
     numbers = {other["label"]: str(other["number"]) for other in rows}
     states = ["failed" if e["rows"][at]["failed"] else f"{len(e['rows'][at]['runs'])}/{seeds}" for e in entries]
+    states = ["file" if row.get("file") and s != "failed" else s for s in states]
     states = ["blank" if e["rows"][at].get("not_as_named") else s for e, s in zip(entries, states, strict=True)]
     label = f"({row['label']})" if row["given_up"] else row["label"]
     return [str(row["number"]), label, numbers.get(row["built_on"], ""), ", ".join(states)]

@@ -50,12 +50,14 @@ class TableEntry:
         base: Name of the recipe that the first row changes, or the recipe.
         rows: From top to bottom.
         about: What it shows, in one line.
+        columns: Shown where they were measured, beside those that every table shows.
     """
 
     name: str
     base: Any
     rows: tuple[RowEntry, ...]
     about: str = ""
+    columns: tuple[str, ...] = ()
 
 
 def is_table_file(word: str) -> bool:
@@ -100,7 +102,7 @@ def _from_json(path: Path) -> Table:
             recipe, change = _changed(own or recipes.get(below or "", base), one.change, f"rows.{at}.change")
             recipes[one.label] = recipe
             rows.append(replace(plain, change=change, recipe=own))
-        table = Table(entry.name, entry.about, base, tuple(rows))
+        table = Table(entry.name, entry.about, base, tuple(rows), entry.columns)
         build(table)
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from error

@@ -18,6 +18,7 @@ from surfkit.raster.select import Device
 from surfkit.run.folder import Run, note_metrics
 from surfkit.run.measure import note_compressed
 from surfkit.run.resume import read_unchanged
+from surfkit.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,11 @@ class Truth:
 
         What `surfkit evaluate` has measured with other settings, or in another volume, is not that.
         """
-        geometry = (metrics.get("compressed") or {} if compressed else metrics).get("geometry") or {}
+        own = metrics.get("compressed") or {} if compressed else metrics
+        geometry = own.get("geometry") or {}
         made = geometry.get("table")
         is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
-        return geometry.get("truth") == str(self.path) and is_same
+        return geometry.get("truth") == str(self.path) and is_same and "mesh" in own  # older versions have none
 
     def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
@@ -87,15 +89,29 @@ class Truth:
         shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
         if not shown.mesh_record.exists():
             raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
-        crop, scene = self.crop(out), read_unchanged(run)
-        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
-        files = (shown.mesh, self.path)
-        found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)
-        found["table"] = {"tau": self.tau, "truth": self.stamp}
-        if not crop.exists():
-            write_json(crop, read_json(shown.out / "geometry" / "crop.json", Any))
-        metrics = note_metrics(shown.metrics, {"geometry": found})
+        found = self.compare(shown.mesh, shown.out / "geometry", out, read_unchanged(run))
+        metrics = note_metrics(shown.metrics, found)
         return metrics if shown is run else note_compressed(run, metrics)
+
+    def compare(self, mesh: Path, folder: Path, out: Path, scene: Scene) -> dict[str, Any]:
+        """What metrics.json is to say of a mesh in the frame of a scene, against this, in the volume of the table.
+
+        Args:
+            mesh: The file.
+            folder: Gets pictures and clouds.
+            out: Of the table.
+            scene: Whose views decide the volume, if none is kept yet.
+
+        Raises:
+            BadInput: The mesh is nowhere near the truth.
+        """
+        crop = self.crop(out)
+        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
+        found = measure_geometry((mesh, self.path), settings, folder, scene.train, scene.frame)
+        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
+        if not crop.exists():
+            write_json(crop, read_json(folder / "crop.json", Any))
+        return found
 
 
 def mesh_of_compressed(run: Run, device: Device) -> Run:

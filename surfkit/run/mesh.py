@@ -238,9 +238,11 @@ def forget_geometry(run: Run) -> None:
         with suppress(BadInput):  # damaged: others say so
             metrics = read_json(path, dict[str, Any]) if path.exists() else {}
             measured = metrics.get(part) if part else metrics
-            if isinstance(measured, dict) and measured.pop("geometry", None) is not None:
+            if isinstance(measured, dict) and {"geometry", "mesh"} & measured.keys():
+                found |= "geometry" in measured
+                for name in ("geometry", "mesh"):
+                    measured.pop(name, None)
                 write_json(path, metrics)
-                found = True
     if found:
         emit(Warned("precision, recall and F1 were of the mesh before: `surfkit evaluate` with --gt measures this one"))
 

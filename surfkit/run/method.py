@@ -309,13 +309,18 @@ def splats_of(run: Run, made: Reconstruction) -> SplatModel:
 
 def refuse_not_drawn(run: Run) -> None:
     """BadInput if what a run has made cannot draw pictures."""
+    if not is_drawn(run):
+        raise BadInput(
+            f"{run.out}: {draws_nothing(run)}, so photographs cannot be compared with any; to measure its mesh, leave "
+            "out --seen, --seams and --lod"
+        )
+
+
+def is_drawn(run: Run) -> bool:
+    """Whether what a run has made can draw pictures; so is what is not made yet."""
     path = result_path(run)
     kept = read_json(path, Kept) if path.exists() else None
-    if kept is not None and kept.primitive is None and not kept.draws:
-        raise BadInput(
-            f"{run.out}: {draws_nothing(run)}, so photographs cannot be compared with any; to measure its mesh, name "
-            "the truth with --gt, without --seen and --seams"
-        )
+    return kept is None or kept.primitive is not None or kept.draws
 
 
 def draws_nothing(run: Run) -> str:

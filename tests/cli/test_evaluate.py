@@ -194,3 +194,57 @@ def test_borders_of_blocks(in_blocks, folder, capsys):
     assert 0.01 < counts[0] / sum(counts) < 0.25
     status, _, error = spoken(capsys, in_blocks, "--seams", 2)
     assert status == 2 and "does not say how long its unit is; give --seams auto" in error
+
+
+def ridges(path):
+    """A mesh of ridges of 2 cm above z = 0, sides of 0.2 m at 11.3 degrees, and the plane in their middle as truth."""
+    x = np.arange(-40, 41) * 0.1
+    heights = np.where(np.arange(81) % 2, 0.02, 0.0)
+    vertices = [[a, b, h] for b in (-4.0, 4.0) for a, h in zip(x, heights, strict=True)]
+    faces = [face for i in range(80) for face in ([i, i + 1, 82 + i], [i, 82 + i, 81 + i])]
+    trimesh.Trimesh(vertices, faces, process=False).export(path / "ridges.ply")
+    flat = [[a, b, 0.01] for a, b in ((-4, -4), (4, -4), (4, 4), (-4, 4))]
+    trimesh.Trimesh(flat, [[0, 1, 2], [0, 2, 3]], process=False).export(path / "flat.ply")
+    return path / "ridges.ply", path / "flat.ply"
+
+
+def test_a_mesh_by_itself(tmp_path, capsys):
+    mesh, truth = ridges(tmp_path)
+    status, said, _ = spoken(capsys, mesh)
+    found = json.loads((tmp_path / "ridges-geometry" / "metrics.json").read_text())
+    assert status == 0 and set(found) == {"mesh"} and found["mesh"]["boundary_edges"] == 162
+    assert "160, 2.451 per square unit" in said and "0.000% of 160: all triangles" in said  # 160 / (64 * sqrt(1.04))
+    assert spoken(capsys, mesh, "--device", "cpu")[0] == 2
+    options = ("--gt", truth, "--tau", 0.1, "--crop", "none", "--align", "none", "--draws", 1)
+    status, said, _ = spoken(capsys, mesh, *options)
+    after = json.loads((tmp_path / "ridges-geometry" / "metrics.json").read_text())
+    slope = np.degrees(np.arctan(0.2))
+    assert after["mesh"]["triangles"] == 160 and after["geometry"]["f1"] > 0.99
+    assert after["geometry"]["normals"]["median"] == pytest.approx(slope, abs=1e-4)
+    assert after["geometry"]["normals"]["p90"] == pytest.approx(slope, abs=1e-4)
+    assert after["geometry"]["roughness"]["on_truth_planes"] is None  # tau is too wide for the ball of 2 cm
+    assert "half of them within 11.3 degrees" in said and "non-manifold edges" in said
+
+
+def test_roughness_where_the_truth_is_plane(tmp_path, capsys, monkeypatch):
+    """Heights between 0 and h, all as often, have a standard deviation of h over the root of 12."""
+    from surfkit.evaluate.mesh import roughness
+
+    monkeypatch.setattr(roughness, "SHARE", 1 / 8)
+    mesh, truth = ridges(tmp_path)
+    options = ("--gt", truth, "--tau", 0.1, "--crop", "none", "--align", "none", "--draws", 1, "--out", tmp_path)
+    assert spoken(capsys, mesh, *options)[0] == 0
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert found["geometry"]["roughness"]["radius"] == 1 and found["geometry"]["roughness"]["places"] > 300
+    for rough in (found["geometry"]["roughness"]["on_truth_planes"], found["mesh"]["roughness"]["on_planes"]):
+        assert rough == pytest.approx(0.02 / np.sqrt(12), rel=0.02)
+
+
+def test_the_mesh_of_a_run_by_itself(folder, capsys, tmp_path):
+    """In its units, and told beside the photographs; a mesh is measured again after it was made again."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    shutil.copy(ridges(tmp_path)[0], tmp_path / "run" / "mesh.ply")
+    status, said, _ = spoken(capsys, tmp_path / "run", "--lpips-weights", "none")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert status == 0 and metrics["mesh"]["triangles"] == 160 and metrics["images"]["psnr"]
+    assert "boundary edges" in said and "PSNR" in said

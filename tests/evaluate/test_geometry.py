@@ -270,7 +270,9 @@ def test_everything_is_written(tmp_path):
     write_points(tmp_path / "ours.ply", ours, grey[: len(ours)])
     out, settings = tmp_path / "geometry", Comparison(draws=2, align="rigid", visible=0.5)
     files = (tmp_path / "ours.ply", tmp_path / "truth.ply")
-    found = measure_geometry(files, settings, out, synthetic.train, synthetic.frame)
+    measured = measure_geometry(files, settings, out, synthetic.train, synthetic.frame)
+    found = measured["geometry"]
+    assert set(measured) == {"geometry"} and "normals" not in found, "of clouds there is nothing else to measure"
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["precision"] > 0.99 and 0.4 < found["recall"] < 0.95 and 0 <= found["f1_std"] < 0.01
     assert set(found["alignments"]) == {"none", "rigid", "similarity"} and found["crop"]["from"] == "auto"
@@ -290,5 +292,5 @@ def test_everything_is_written(tmp_path):
             assert len(picture.getcolors(1 << 20)) > 20, name
     assert read_surface(out / "precision.ply").vertices().shape[1] == 3
     settings = Comparison(draws=2, align="rigid", crop=str(out / "crop.json"), classes=False)
-    again = measure_geometry(files, settings, tmp_path / "again")
+    again = measure_geometry(files, settings, tmp_path / "again")["geometry"]
     assert again["f1"] == found["f1"] and "classes" not in again and not list((tmp_path / "again").glob("class-*"))

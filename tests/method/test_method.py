@@ -221,7 +221,9 @@ def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data,
 
     capsys.readouterr()
     assert "makes no splats, so there are no points to write" in refused("export", out)
-    assert "method:lower does not draw pictures" in refused("evaluate", out) and "--gt" in refused("evaluate", out)
+    assert "method:lower does not draw pictures" in refused("evaluate", out, "--seen", 2)
+    assert main(["evaluate", str(out)]) == 0 and "boundary edges" in capsys.readouterr().out
+    assert json.loads((out / "metrics.json").read_text())["mesh"]["components"] == 1
     assert "the method of the run made its mesh" in refused("mesh", out, "mesh:tsdf", "--mesh.voxel", 1)
     assert "the method of the run made its mesh" in refused("mesh", out, "--mesh.voxel", 1)
     assert "has no points; draw --of loss" in refused("curves", out, "--out", tmp_path / "curves.png")

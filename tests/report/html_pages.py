@@ -100,6 +100,11 @@ def full_run(out, text="plain"):
     scores = {"precision": 0.5, "recall": 0.5, "f1": 0.5}
     metrics["geometry"] = scores | {"truth": text, "align": text, "tau": 0.5, "classes": {text: {text: scores}}}
     metrics["geometry"]["curve"] = {"tau": [0, 1, 2], "precision": [0, 0.5, 1], "recall": [0, 0.4, 0.8]}
+    metrics["geometry"]["normals"] = {"median": 12.3, "p90": 45.6}
+    metrics["geometry"]["roughness"] = {"on_truth_planes": 0.078}
+    rough, crossing = {"on_planes": 0.034, "planes": 0.5, "radius": 1.0}, {"share": 0.0125, "measured": 7}
+    metrics["mesh"] = {"unit": text, "triangles": 7, "boundary_share": 0.25, "components": 2, "file": text}
+    metrics["mesh"] |= {"crossing": crossing, "roughness": rough, "non_manifold_edges": 3, "triangles_per_area": 9.5}
     metrics["compressed"] = {"images": {"psnr": 19.0, "ssim": 0.4}, "fps_before_and_after": [9.0, 10.0]}
     write(out / "metrics.json", metrics)
     write(

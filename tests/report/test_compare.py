@@ -65,6 +65,14 @@ def test_figures_are_found_in_the_metrics():
     geometry = {"f1": 0.5, "precision": 0.4, "recall": 0.6, "points": {"truth": 9}, "tau": 1.0}
     more = figures(metrics | {"prepare_cpu_seconds": 2.0, "geometry": geometry})
     assert more == plain | {"f1": 0.5, "precision": 0.4, "recall": 0.6, "cpu_seconds": 7.0}
+    mesh = {"triangles": 8, "triangles_per_area": 2.5, "boundary_share": 0.25, "components": 2, "non_manifold_edges": 1}
+    parts = {"crossing": {"share": 0.125, "measured": 8}, "roughness": {"on_planes": 0.5, "radius": 1.0}}
+    told = {"normals": {"median": 5.0, "p90": 30.0}, "roughness": {"on_truth_planes": None}}
+    found = figures(metrics | {"geometry": told, "mesh": mesh | parts | {"unit": "m"}})
+    wanted = {"crossing_share": 0.125, "roughness": 0.5, "normals_median": 5.0, "normals_p90": 30.0}
+    assert found == plain | mesh | wanted, "what is not known is left out"
+    with pytest.raises(BadInput, match="crossing"):
+        figures(metrics | {"mesh": {"crossing": 3}})
     images = metrics["images"] | {"lpips_alex": 0.3, "lpips_vgg": 0.9}
     assert figures(metrics | {"images": images}) == plain | {"lpips": 0.3}
     with pytest.raises(BadInput, match="seconds"):
@@ -79,7 +87,9 @@ def test_of_a_compressed_model_its_own_quality_size_and_speed_count():
     assert found == {
         "psnr": 0.9, "ssim": 0.1, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0, "bytes": 7, "fps": 8.0,
     }, "its F1 is not that of the model before"  # fmt: skip
-    geometry = {"f1": 0.3, "precision": 0.2, "recall": 0.4}
+    geometry, alone = {"f1": 0.3, "precision": 0.2, "recall": 0.4}, {"mesh": {"components": 4}}
+    both = figures(metrics | alone | {"compressed": small | {"mesh": {"components": 5}}}, compressed=True)
+    assert both["components"] == 5 and "components" not in figures(metrics | alone | {"compressed": small}, True)
     assert figures(metrics | {"compressed": small | {"geometry": geometry}}, compressed=True) == found | geometry
     assert figures(metrics | {"compressed": small})["bytes"] == 70, "a recipe without compression"
     with pytest.raises(BadInput, match="no compressed model, which the recipe wants"):

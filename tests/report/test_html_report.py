@@ -129,6 +129,11 @@ def test_everything_is_shown(run):
     assert rows_of(text, "Compressed")[1] == [
         "run", "plain", "10 B", "25.0%", "19.00 -1.00", "0.400 -0.100", "\N{EN DASH}", "10.0 +1.0",
     ]  # fmt: skip
+    alone = rows_of(text, "The mesh by itself")
+    assert ["share of edges with one triangle", "25.00%"] in alone and ["triangles per square unit", "9.5"] in alone
+    assert ["share of triangles that cross others", "1.250%"] in alone
+    assert ["angle between normals, 90 % quantile, degrees", "45.6"] in rows_of(text, "Mesh against the truth")
+    assert ["roughness where the truth is plane", "0.078"] in rows_of(text, "Mesh against the truth")
     assert found.tags.count("input") == len(found.values("data-chart")) + 3, "a slider for each chart and comparison"
     assert all(label for label in found.values("aria-label", "input"))
     assert len(found.values("alt", "img")) == found.tags.count("img") and all(found.values("alt", "img"))

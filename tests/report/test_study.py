@@ -27,7 +27,7 @@ from surfkit.report import rows
 from surfkit.report.ablation import Row, Table, build
 from surfkit.report.rows import Outcome
 from surfkit.report.screen import Screen
-from surfkit.report.study import Plan, ablate, fingerprint, report_of, run_folder, trials, unfinished
+from surfkit.report.study import Plan, ablate, fingerprint, report_of, report_so_far, run_folder, trials, unfinished
 from surfkit.report.table import lines, markdown
 from surfkit.report.truth import Truth
 from surfkit.run import shared
@@ -283,7 +283,8 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
             raise BadInput("nowhere near")
         calls.append(settings.crop)
         write_json(out / "crop.json", {})
-        return {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
+        found = {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
+        return {"geometry": found, "mesh": {"components": len(calls)}}
 
     monkeypatch.setattr(truth, "opened", Opened)
     monkeypatch.setattr(truth, "read_unchanged", lambda run: read(run.data))
@@ -400,12 +401,14 @@ def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):
 
     def metrics(truth):
         return {
-            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}}
+            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}},
+            "mesh": {},
         }
 
     assert given.known(metrics(given)) and automatic.known(metrics(automatic))
     assert not automatic.known(metrics(given)), "the threshold was given, and is now that of the spacing"
     assert not given.known({"geometry": {"f1": 0.9, "truth": str(file), "tau": 0.5, "align": "rigid"}}), "by evaluate"
+    assert not given.known({"geometry": metrics(given)["geometry"]}), "by an older version, without the mesh by itself"
     before, crop = metrics(given), given.crop(tmp_path)
     file.write_text("another truth")
     assert not given.known(before) and given.crop(tmp_path) != crop
@@ -441,3 +444,68 @@ def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 4 and said[0].startswith("run 1 of 2: base, seed 0, in ")
     assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"
+
+
+def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
+    """They are measured once, in the volume that is kept, and stand below the rows; a bad one does not stop others."""
+    from surfkit.report import others, truth
+
+    calls = []
+
+    def measure(files, settings, out, views, frame):
+        calls.append(files[0].name)
+        if files[0].name == "bad.ply":
+            raise BadInput("nowhere\nnear")
+        out.mkdir(parents=True)
+        write_json(out / "crop.json", {})
+        return {
+            "geometry": {"f1": 0.7, "normals": {"p90": 30.0}},
+            "mesh": {"components": 3, "crossing": {"share": 0.1}},
+        }
+
+    monkeypatch.setattr(truth, "measure_geometry", measure)
+    corners = "0 0 0\n1 0 0\n0 1 0\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    face = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    for name in ("good", "bad", "gt"):
+        (tmp_path / f"{name}.ply").write_text(f"{head}{face}{corners}3 0 1 2\n")
+    meshes = tuple(others.OtherMesh.parsed(f"{name}={tmp_path}/{name}.ply") for name in ("good", "bad"))
+    table = replace(TABLE, rows=TABLE.rows[:1], columns=("components", "crossing_share"))
+    known = truth.Truth(tmp_path / "gt.ply", 0.5)
+    plan = Plan(table, (data,), tmp_path / "out", rows=("base",), truth=(known,), meshes=meshes)
+    monkeypatch.setattr("surfkit.report.study.unfinished", lambda plan: [])
+    report = ablate(plan, Silent())
+    base, good, bad = rows_in(report)
+    assert (good["number"], good["group"], good["mean"]["f1"], good["built_on"]) == (2, "Other programs", 0.7, None)
+    assert (
+        good["mean"]["components"] == 3 and good["mean"]["normals_p90"] == 30 and good["mean"]["crossing_share"] == 0.1
+    )
+    assert (bad["mean"], bad["failed"], bad["group"]) == ({}, "nowhere near", "") and base["failed"] is None
+    assert known.crop(plan.out).exists() and (plan.out / good["runs"][0]["folder"] / "metrics.json").exists()
+    text = (plan.out / "ablation.md").read_text()
+    assert "| 2 | good |  | file |" in text and "| 10.000 % |" in text and "bad: failed: nowhere near" in text
+    assert "normals" not in text, "which this table does not show"
+    assert rows_in(report_so_far(plan))[1]["mean"] == good["mean"]
+    ablate(plan, Silent())
+    assert calls == ["good.ply", "bad.ply", "bad.ply"], "what is measured is not measured again"
+    (tmp_path / "good.ply").write_text((tmp_path / "good.ply").read_text() + "\n")
+    assert rows_in(report_so_far(plan))[1]["mean"] == {}, "another file"
+
+
+@pytest.mark.parametrize(
+    ("words", "change", "message"),
+    [
+        (["x"], {}, "--meshes x: give LABEL=FILE"),
+        (["x={f}/gone.ply"], {}, "--meshes x: .*gone.ply: no such file"),
+        (["x={f}/gt.ply"], {"truth": ()}, "name it with --gt"),
+        (["base={f}/gt.ply"], {}, "table:twins has such a row already"),
+        (["x={f}/gt.ply", "x={f}/gt.ply"], {}, "choose another label"),
+    ],
+)
+def test_meshes_that_cannot_be_rows(data, tmp_path, words, change, message):
+    from surfkit.report import others, truth
+
+    (tmp_path / "gt.ply").write_text("a truth")
+    with pytest.raises(BadInput, match=message):
+        meshes = tuple(others.OtherMesh.parsed(word.format(f=tmp_path)) for word in words)
+        Plan(TABLE, (data,), tmp_path, **{"truth": (truth.Truth(tmp_path / "gt.ply", 0.5),), **change}, meshes=meshes)

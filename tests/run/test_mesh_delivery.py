@@ -52,7 +52,8 @@ def test_what_was_measured_of_the_mesh_before_is_gone(tmp_path, monkeypatch, par
     told, out = [], tmp_path / "run"
     monkeypatch.setattr(delivering, "emit", told.append)
     (out / "compressed").mkdir(parents=True)
-    own, small = {"psnr": 20.0, "geometry": {"f1": 0.5}}, {"psnr": 19.0, "geometry": {"f1": 0.4}}
+    own = {"psnr": 20.0, "geometry": {"f1": 0.5}, "mesh": {"triangles": 2}}
+    small = {"psnr": 19.0, "geometry": {"f1": 0.4}, "mesh": {"triangles": 1}}
     write_json(out / "metrics.json", own | {"compressed": small})
     write_json(out / "compressed" / "metrics.json", small)
     forget_geometry(Run(out / part, Recipe(), Data(tmp_path)))

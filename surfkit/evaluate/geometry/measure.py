@@ -22,12 +22,14 @@ from surfkit.evaluate.geometry.errors import (
     write_plan,
     write_row,
 )
+from surfkit.evaluate.geometry.faithful import normal_angles, roughness_on_truth
 from surfkit.evaluate.geometry.place import same_plan
 from surfkit.evaluate.geometry.repetition import Draw
 from surfkit.evaluate.geometry.scores import chamfer, curve, shares
 from surfkit.evaluate.geometry.surface import read_surface, system_of
 from surfkit.evaluate.geometry.transform import apply, scale_of, write_transform
 from surfkit.evaluate.images.seams import Seams
+from surfkit.evaluate.mesh.measure import measure_mesh
 from surfkit.scene.crop import write_crop
 from surfkit.scene.scene import Frame, View
 
@@ -48,7 +50,8 @@ def measure_geometry(
     frame: Frame | None = None,
     seams: Seams | None = None,
 ) -> dict[str, Any]:
-    """Compare a mesh or cloud with the truth, write what there is to look at into a folder, and return the figures.
+    """Compare a mesh or cloud with the truth, write what there is to look at into a folder, and return the figures:
+    "geometry" against the truth, and of a mesh "mesh", what is measured of it alone.
 
     Args:
         files: The reconstruction and the truth.
@@ -65,8 +68,13 @@ def measure_geometry(
     reconstruction, truth = map(read_surface, files)
     if settings.transform is None and frame is not None:
         warn_of_other_system(files[1], frame)
+    metres = None if frame is None else frame.metres
+    alone = None if reconstruction.faces is None else measure_mesh(reconstruction, metres)
     outcome = compare(reconstruction, truth, settings, views, frame)
     found = figures(outcome, settings) | {"reconstruction": str(files[0]), "truth": str(files[1])}
+    if alone is not None:
+        found["normals"] = normal_angles(outcome, np.random.default_rng(settings.seed))
+        found["roughness"] = roughness_on_truth(outcome, alone.roughness, alone.metres or 1.0)
     for left in (*out.glob("view[0-9].png"), *out.glob("class-*.png")):  # of an earlier comparison
         left.unlink()
     write_files(out, outcome, settings)
@@ -76,7 +84,7 @@ def measure_geometry(
         classes = classify(outcome, settings, views, frame, seams)
         found["classes"] = class_figures(classes, outcome.draws[0], outcome.tau)
         write_classes(out, outcome, classes, views, frame)
-    return found
+    return {"geometry": found} | ({} if alone is None else {"mesh": alone.figures})
 
 
 def warn_of_other_system(truth: Path, frame: Frame) -> None:

@@ -14,7 +14,7 @@ from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.heights import RASTERS, raster_system, read_heights_raster
 from surfkit.evaluate.geometry.las import CLOUDS, SCANS, las_notes, read_e57, read_las
 from surfkit.evaluate.geometry.lists import fans, has_lists, points_beside_lists
-from surfkit.evaluate.geometry.place import offset_in, place_of, root_of
+from surfkit.evaluate.geometry.place import notes_in, offset_in, place_of, root_of
 from surfkit.export.ply import TYPES, read_vertices
 from surfkit.readers.sparse_ply import read_points
 
@@ -67,6 +67,24 @@ def system_of(path: Path) -> str | None:
     if path.suffix.lower() in CLOUDS:
         return las_notes(path).get("crs")
     return raster_system(path) if path.suffix.lower() in RASTERS else None
+
+
+def metres_in(path: Path) -> float | None:
+    """Metres per unit, as surfkit writes it into PLY files; None where the file does not say.
+
+    Raises:
+        BadInput: It says something else than a length.
+    """
+    if path.suffix.lower() != ".ply":
+        return None
+    told = notes_in("\n".join(_header(path))).get("metres per unit")
+    try:
+        metres = None if told is None else float(told)
+    except ValueError:
+        metres = 0.0
+    if metres is not None and not 0 < metres < np.inf:
+        raise BadInput(f"{path}: comment metres per unit: {told}: it must be a number above 0; write the file again")
+    return metres
 
 
 def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:

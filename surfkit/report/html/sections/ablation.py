@@ -86,6 +86,8 @@ def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, Source], data_s
         label = row["label"] if at not in dimmed else f"({row['label']})"
         failed = row.get("failed")
         note = f"failed: {failed}" if isinstance(failed, str) else ""
+        if isinstance(file := row.get("file"), str) and not note:
+            note = f"mesh of another program: {file}"
         if isinstance(other := row.get("not_as_named"), str):
             note = f"not run as named: {other}"
         first = (Cell(f"{at + 1}. {label}", at, note, link), Cell(str(len(seeds)), len(seeds)))

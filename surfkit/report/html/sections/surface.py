@@ -44,7 +44,8 @@ def meshes(runs: Sequence[Source], with_pictures: bool) -> Section | None:
     for run in made:
         elements = [*(_views([run]) if not are_alike else []), *_above(run)] if with_pictures else []
         elements = [Row(tuple(elements), size="wide")] if elements else []
-        groups.append(Group(heading(run, runs), (*elements, _mesh_table(run)), run.id("mesh")))
+        tables = (_mesh_table(run), *_quality(run))
+        groups.append(Group(heading(run, runs), (*elements, *tables), run.id("mesh")))
     return Section("mesh", "Mesh", tuple(groups)) if groups else None
 
 
@@ -101,6 +102,28 @@ def _mesh_table(run: Source) -> Table:
     return Table("The mesh", ("quantity", "value"), tuple(rows))
 
 
+def _quality(run: Source) -> list[Element]:
+    """What `surfkit evaluate` has measured of the mesh by itself."""
+    found = mapping(run.metrics, "mesh")
+    unit = "m" if found.get("unit") == "m" else "units"
+    forms = (
+        (("triangles",), "triangles", ",.0f"),
+        (("triangles_per_area",), f"triangles per square {'metre' if unit == 'm' else 'unit'}", ",.4g"),
+        (("boundary_share",), "share of edges with one triangle", ".2%"),
+        (("components",), "connected parts", ",.0f"),
+        (("non_manifold_edges",), "edges with more than two triangles", ",.0f"),
+        (("crossing", "share"), "share of triangles that cross others", ".3%"),
+        (("crossing", "measured"), "triangles that this was measured on", ",.0f"),
+        (("roughness", "on_planes"), f"roughness on planes of the mesh, {unit}", ".3g"),
+        (("roughness", "planes"), "share of the area that is planes", ".0%"),
+        (("roughness", "radius"), f"radius that roughness is measured in, {unit}", ".3g"),
+    )
+    rows = [
+        plain(label, f"{value:{form}}") for path, label, form in forms if (value := number(found, *path)) is not None
+    ]
+    return [Table("The mesh by itself", ("quantity", "value"), tuple(rows))] if rows else []
+
+
 def geometry(runs: Sequence[Source], with_pictures: bool) -> Section | None:
     """Precision and recall of each run whose mesh was compared with a truth, and where the errors are."""
     groups = []
@@ -123,6 +146,13 @@ def _scores(found: dict[str, Any]) -> Table:
     for name in ("accuracy", "completeness", "overall"):
         if (value := number(found, "chamfer", name)) is not None:
             rows.append(plain(f"chamfer distance, {name}", f"{value:.3f}"))
+    for path, label, form in (
+        (("normals", "median"), "angle between normals, median, degrees", ".1f"),
+        (("normals", "p90"), "angle between normals, 90 % quantile, degrees", ".1f"),
+        (("roughness", "on_truth_planes"), "roughness where the truth is plane", ".3g"),
+    ):
+        if (value := number(found, *path)) is not None:
+            rows.append(plain(label, f"{value:{form}}"))
     for name in ("align", "truth", "reconstruction"):
         if isinstance(value := found.get(name), str):
             rows.append(plain("alignment" if name == "align" else name, value))
