@@ -173,12 +173,11 @@ def _referenced(mesh: Mesh) -> Mesh:
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     place = (np.cumsum(used) - 1).astype(np.int32)
-    colors = None if mesh.colors is None else mesh.colors[used]
-    return replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], colors=colors)
+    return mesh.take(used, place[mesh.faces])
 
 
 def _welded(mesh: Mesh) -> Mesh:
-    """The mesh with vertices in the same place made one; the first of them gives the colour."""
+    """The mesh with vertices in the same place made one; the first of them gives colour and values."""
     places = np.ascontiguousarray(mesh.vertices + np.float32(0))  # -0 becomes 0
     # Only those whose hashes are not their own are compared: sorting all places takes twice as long.
     x, y, z = places.view(np.uint32).T.astype(np.uint64)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
@@ -16,12 +17,13 @@ from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
-from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain
+from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import Report, clean
+from surfkit.mesh.closed import closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.shade import from_above, shaded, up_of
-from surfkit.mesh.simplify import require_simplification, simplify_to
+from surfkit.mesh.simplify import require_kernels, simplified
 from surfkit.mesh.stereo import points
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
@@ -32,7 +34,7 @@ from surfkit.readers.masks import mask_cache
 from surfkit.run.folder import Run
 from surfkit.scene.crop import Crop, box, read_crop
 from surfkit.scene.photos import view_photo
-from surfkit.scene.scene import Scene, View
+from surfkit.scene.scene import Frame, Scene, View
 
 SHOWN = 4
 """Training views that pictures are made of."""
@@ -52,6 +54,18 @@ class MeshOutput:
 
     lods: tuple[float, ...] = ()
     """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
+
+    triangles: int | None = None
+    """Simplify the mesh to at most this many triangles, in the order in which they matter least; flat places get large
+    ones. With `--error`, it ends at whichever comes first."""
+
+    error: float | None = None
+    """Simplify the mesh until its surface would move by more than about this: metres, or units of the data set where it
+    does not say how long these are. One place of a hundred may move farther."""
+
+    watertight: bool = False
+    """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets walls
+    and a flat base. Small loose sheets are left out."""
 
     clusters: int = 50
     """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""
@@ -87,8 +101,13 @@ class MeshOutput:
             raise BadInput("--formats: name at least one of ply, obj, glb")
         if self.crop is not None and self.crop_box is not None:
             raise BadInput("--crop and --crop-box: give one of the two")
-        if self.lods:
-            require_simplification("--lods")
+        if self.triangles is not None and self.triangles < 4:
+            raise BadInput(f"--triangles {self.triangles}: give 4 or more")
+        if self.error is not None and not 0 < self.error < float("inf"):
+            raise BadInput(f"--error {self.error:g}: it must be more than 0")
+        for name in ("lods", "triangles", "error", "watertight"):
+            if getattr(self, name):
+                require_kernels(f"--{name}")
 
     def volume(self) -> Crop | None:
         """The crop, in the frame of the input."""
@@ -170,12 +189,15 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     forget_spooled(run.out)
     raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
     facts = plain_facts(maker_of(run, mesher), raw)
+    require_values(raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     least = delivery.clusters, delivery.least_triangles
     mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
     del raw
+    mesh, done = finished(mesh, delivery, subject)
+    meshes = levels(mesh, delivery, frame)
     before = delete_meshes(run)
-    written = list(write_files(run, mesh, delivery, subject))
+    written = list(write_files(run, meshes, delivery, subject))
     if gone := sorted(before - {path.name for path in written}):
         emit(Warned(f"{', '.join(gone)} of the mesh before {'is' if len(gone) == 1 else 'are'} gone"))
     record = {
@@ -184,6 +206,9 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "steps": steps,
         "facts": facts,
         "cleaning": describe(report, subject),
+        **done,
+        "triangles": len(mesh.faces),
+        "vertices": len(mesh.vertices),
         "files": [path.name for path in written],
         "crs": frame.crs,
         "offset": list(frame.shift),
@@ -212,6 +237,54 @@ def plain_facts(maker: str, mesh: Mesh) -> dict[str, Any]:
     except BadInput as error:
         raise BadInput(f"{maker}: {error}") from error
     return facts
+
+
+def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh, dict[str, Any]]:
+    """A clean mesh, closed and simplified as is wanted, and what mesh.json says of that.
+
+    It is closed first: what closes it is simplified with it, and simplifying opens nothing.
+
+    Raises:
+        BadInput: It cannot be closed.
+    """
+    done: dict[str, Any] = {}
+    frame = subject.frame
+    if delivery.watertight:
+        emit(Progress("closing", 0, 1))
+        up = up_of(mesh, [view.camera for view in subject.views])
+        mesh, closing = closed(mesh, up)
+        emit(Progress("closing", 1, 1))
+        base = None if closing.base is None else float(frame.to_input(closing.base * up) @ up)
+        done["closing"] = dump(closing) | {"base": base, "volume": closing.volume / frame.scale**3}
+    if delivery.triangles is not None or delivery.error is not None:
+        emit(Progress("simplifying", 0, 1))
+        before, error = len(mesh.faces), delivery.error
+        if error is not None:
+            error = error * frame.scale if frame.local_metres is None else error / frame.local_metres
+        mesh = simplified(mesh, delivery.triangles, error)
+        emit(Progress("simplifying", 1, 1))
+        done["simplification"] = {"triangles_before": before, "triangles": len(mesh.faces)}
+        if delivery.triangles is not None and len(mesh.faces) > delivery.triangles:
+            why = "no further edge can be collapsed" if delivery.error is None else "further ones would move it too far"
+            emit(Warned(f"--triangles {delivery.triangles}: {len(mesh.faces):,} are left, as {why}"))
+    return mesh, done
+
+
+def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Mesh]]:
+    """The meshes to be written, by name: all of it, and with shares of its triangles.
+
+    Raises:
+        BadInput: It is to be closed, and one of them would not be.
+    """
+    meshes = [("mesh", mesh)]
+    for at, share in enumerate(delivery.lods, 1):
+        meshes.append((f"mesh-lod{at}", simplified(mesh, max(1, round(share * len(mesh.faces))))))
+        emit(Progress("simplifying", at, len(delivery.lods)))
+    if delivery.watertight:  # also as GLB rounds them
+        for name, each in meshes:
+            for places in (each.vertices, frame.to_file(each.vertices).astype(np.float32)):
+                require_closed(replace(each, vertices=places), name)
+    return meshes
 
 
 def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
@@ -245,12 +318,10 @@ def forget_geometry(run: Run) -> None:
         emit(Warned("precision, recall and F1 were of the mesh before: `surfkit evaluate` with --gt measures this one"))
 
 
-def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> Iterator[Path]:
-    """Write the mesh in all formats and levels, and give the paths."""
-    meshes = [("mesh", mesh)]
-    for at, share in enumerate(delivery.lods, 1):
-        meshes.append((f"mesh-lod{at}", simplify_to(mesh, max(1, round(share * len(mesh.faces))))))
-        emit(Progress("simplifying", at, len(delivery.lods)))
+def write_files(
+    run: Run, meshes: Sequence[tuple[str, Mesh]], delivery: MeshOutput, subject: MeshInput
+) -> Iterator[Path]:
+    """Write meshes, by name, in all formats, and give the paths."""
     for name, each in meshes:
         kinds = list(dict.fromkeys(delivery.formats))
         for kind in kinds:

@@ -58,7 +58,6 @@ def test_the_same_command_again_makes_nothing_and_another_mesher_only_the_mesh(f
 
 def test_another_mesh_of_the_same_run(finished, tmp_path, capsys, quick_comparison):
     out, _ = finished
-    needs("fast_simplification", "--lods")
     words = ["mesh:tsdf", "--mesh.voxel", "0.5", "--mesh.least-views", "0.5", "--metres-per-unit", "1"]
     words += ["--formats", "ply", "obj", "glb", "--lods", "0.5", "--least-triangles", "20", "--crop-box"]
     assert main(["mesh", str(out), *words, "-50", "-50", "-2", "50", "50", "3"]) == 0

@@ -29,7 +29,7 @@ def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, wr
     told = []
     monkeypatch.setattr(delivering, "emit", told.append)
     run, subject = SimpleNamespace(out=tmp_path), SimpleNamespace(frame=Frame(np.zeros(3), 1.0))
-    found = list(write_files(run, TRIANGLE, MeshOutput(formats=tuple(formats)), subject))
+    found = list(write_files(run, [("mesh", TRIANGLE)], MeshOutput(formats=tuple(formats)), subject))
     assert [path.name for path in found] == written == [path.name for path in tmp_path.iterdir()]
     (warned,) = [event.text for event in told if isinstance(event, Warned)]
     assert "mesh.glb: 1 triangles" in warned and "at most 500" in warned

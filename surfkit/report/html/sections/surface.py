@@ -91,7 +91,7 @@ def _mesh_table(run: Source) -> Table:
     mesher = mapping(run.mesh, "mesher")
     rows = [plain("mesher", mesher.get("use"))]
     for name in ("triangles", "vertices", "clusters_kept", "clusters", "boundaries", "holes_closed"):
-        if (value := number(cleaning, name)) is not None:
+        if (value := number(run.mesh, name) or number(cleaning, name)) is not None:
             rows.append(plain(name.replace("_", " "), f"{value:,.0f}"))
     if (share := number(cleaning, "boundary_share")) is not None:
         rows.append(plain("share of edges that are boundaries", f"{share:.1%}"))
