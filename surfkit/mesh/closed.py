@@ -67,7 +67,7 @@ def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
         BadInput: It cannot be closed, or encloses nothing; there are no compiled kernels.
     """
     require_kernels("closing a mesh")
-    given = len(mesh.vertices)
+    given = len(np.unique(mesh.faces))
     mesh = separated(mesh)
     cut = len(mesh.vertices) - given
     mesh, scraps = _without_scraps(mesh)
@@ -278,7 +278,7 @@ def _on_base(mesh: Mesh, rims: list[np.ndarray], up: np.ndarray, base: float) ->
         fixed[at_rim] = True
         flat = part.vertices + (base - part.vertices.astype(np.float64) @ up)[:, None] * up
         copy = replace(part, vertices=flat.astype(np.float32), faces=np.ascontiguousarray(part.faces[:, ::-1]))
-        places, bottom, into = collapsed(copy, 1, FLAT, fixed)
+        places, bottom, into = collapsed(copy, 1, FLAT, fixed, flat=True)
         shade = None
         if part.colors is not None:
             shade = np.zeros((len(places), 3))

@@ -52,7 +52,7 @@ def simplified(mesh: Mesh, most: int | None = None, error: float | None = None) 
 
 
 def collapsed(
-    mesh: Mesh, most: int, limit: float, fixed: np.ndarray | None = None
+    mesh: Mesh, most: int, limit: float, fixed: np.ndarray | None = None, *, flat: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(V, 3) float32 vertices and (F, 3) int32 faces that are left, and which of these each vertex stands in; -1: none.
 
@@ -61,10 +61,11 @@ def collapsed(
         most: See `simplified`.
         limit: Most that a collapse may cost: squared distances to planes, weighted by area in mean triangles.
         fixed: (V,) bool: vertices that stay as they are.
+        flat: Whether all lies in a plane; where it is folded there, folds do not grow.
     """
     vertices, faces = np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
     fixed = np.zeros(len(vertices), np.uint8) if fixed is None else fixed.astype(np.uint8)
-    return module().collapse(vertices, faces, max(1, most), limit, fixed)
+    return module().collapse(vertices, faces, max(1, most), limit, fixed, flat)
 
 
 def _means(column: np.ndarray, into: np.ndarray, count: int) -> np.ndarray:

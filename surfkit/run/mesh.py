@@ -17,7 +17,7 @@ from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
-from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain, require_values
+from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.closed import closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
@@ -25,6 +25,7 @@ from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require_kernels, simplified
 from surfkit.mesh.stereo import points
+from surfkit.mesh.values import by_value, ends_of, words_of
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import NEAR
@@ -33,6 +34,7 @@ from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
 from surfkit.run.folder import Run
 from surfkit.scene.crop import Crop, box, read_crop
+from surfkit.scene.lengths import unit_of
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, Scene, View
 
@@ -215,7 +217,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }
-    write_pictures(run, mesh, subject)
+    record["pictures"] = write_pictures(run, mesh, subject)
     write_json(run.mesh_record, record)
     emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
@@ -337,14 +339,24 @@ def write_files(
                 yield path
 
 
-def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
-    """Write pictures of the mesh: from above, and beside the renders of a few training views."""
+def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> dict[str, str]:
+    """Write pictures of the mesh: from above, also coloured by each of its values, and beside the renders of a few
+    training views. What the colours mean, by the name of the picture.
+    """
     count = min(SHOWN, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
-    path = run.mesh_pictures / "above.png"
-    write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
+    path, up = run.mesh_pictures / "above.png", up_of(mesh, cameras)
+    write_picture(path, from_above(mesh, up, LONGEST))
     emit(FileWritten(path, "picture"))
+    told = {}
+    for name, values in mesh.values.items():
+        path, ends = run.mesh_pictures / f"above-{name}.png", ends_of(name, values)
+        write_picture(path, from_above(mesh, up, LONGEST, by_value(name, values, ends)))
+        if name in LENGTHS:
+            ends = ends[0] / subject.frame.scale, ends[1] / subject.frame.scale
+        told[path.name] = words_of(name, ends, unit_of(subject.frame))
+        emit(FileWritten(path, f"picture, {told[path.name]}"))
     for at, view in enumerate(views):
         camera = view.camera.fitted(LONGEST)
         color = subject.draw(view).color.clamp(0, 1)
@@ -354,6 +366,7 @@ def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
         path = run.mesh_pictures / f"view-{at + 1}.png"
         write_picture(path, torch.cat([color, shaded(mesh, camera)], dim=2))
         emit(FileWritten(path, "picture"))
+    return told
 
 
 def has_mesh(run: Run, steps: int, own: bool = False) -> bool:

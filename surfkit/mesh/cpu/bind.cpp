@@ -130,9 +130,9 @@ void add_mesh(nb::module_& m) {
         },
         nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
         nb::arg("least"), nb::arg("shade"), nb::arg("slant"), nb::arg("kernels"), nb::arg("threads"));
-    m.def("collapse", [](Floats vertices, Whole faces, int64_t least, double limit, Bytes fixed) {
+    m.def("collapse", [](Floats vertices, Whole faces, int64_t least, double limit, Bytes fixed, bool flat) {
         const CollapseJob job{vertices.data(), (int64_t)vertices.shape(0), faces.data(), (int64_t)faces.shape(0),
-                              fixed.data(),    least,                      limit};
+                              fixed.data(),    least,                      flat,         limit};
         Collapsed made;
         {
             nb::gil_scoped_release free;

@@ -14,6 +14,7 @@ constexpr int kMostFaces = 64;       // around a vertex
 constexpr double kTurn = 0.2;        // least cosine between the normals of a triangle before and after
 constexpr double kThin = 0.02;       // least height of a triangle over its longest side, unless it was thinner before
 constexpr double kHold = 1e-4;       // pull to the middle of the edge, where the planes leave a direction open
+constexpr double kGrow = 1e-6;       // share by which the area around an edge may grow, where all is flat
 constexpr double kFar = 1.0;         // a vertex moves no farther than this from the middle, in lengths of the edge
 
 struct Point {
@@ -238,16 +239,20 @@ private:
         return true;
     }
 
-    // Whether a triangle of u, without v, would turn over or become thin.
-    bool spoils(int32_t u, int32_t v, Point p) {
+    // Whether a triangle of u, without v, would turn over or become thin. `grown` is what the area grows by.
+    bool spoils(int32_t u, int32_t v, Point p, double& grown) {
         bool found = false;
         each_corner(u, [&](int32_t c) {
             const int32_t b = faces_[after(c)], d = faces_[after(after(c))];
-            if (found || b == v || d == v) return;
             const Point from = place(u), to_b = place(b), to_d = place(d);
             const Point before = cross(to_b - from, to_d - from), now = cross(to_b - p, to_d - p);
             const double old_size = std::sqrt(dot(before, before)), size = std::sqrt(dot(now, now));
-            if (old_size == 0) return;
+            if (b == v || d == v) {
+                grown -= old_size / 2;  // those of the edge are seen from both of its ends
+                return;
+            }
+            grown += size - (1 + kGrow) * old_size;
+            if (found || old_size == 0) return;
             const double rest = dot(to_d - to_b, to_d - to_b);
             const double old_long = std::max({dot(to_b - from, to_b - from), dot(to_d - from, to_d - from), rest});
             const double longest = std::max({dot(to_b - p, to_b - p), dot(to_d - p, to_d - p), rest});
@@ -262,7 +267,8 @@ private:
         if (!stays_a_surface(u, v)) return;
         const Point middle = 0.5 * (place(u) + place(v));
         const Point to = best(u, v).first, p = middle + to;
-        if (spoils(u, v, p) || spoils(v, u, p)) return;
+        double grown = 0;
+        if (spoils(u, v, p, grown) || spoils(v, u, p, grown) || (job_.flat && grown > 0)) return;
         quadrics_[u] = narrow(quadrics_[u].about(p - place(u)) + quadrics_[v].about(p - place(v)));
         int32_t last = -1;
         each_corner(v, [&](int32_t c) {

@@ -13,6 +13,7 @@ struct CollapseJob {
     int64_t face_count;
     const uint8_t* fixed;  // (V) vertices that stay as they are
     int64_t least;         // triangles at which it ends
+    bool flat;             // whether all lies in a plane, on which folds must not grow: nothing else holds them
     double limit;          // most that a collapse may cost: squared distances to planes, weighted by area in mean triangles
 };
 
