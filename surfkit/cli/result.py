@@ -181,8 +181,8 @@ def _finishing_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
     """What was done to a mesh after it was cleaned."""
     rows = []
     if closing := record.get("closing"):
-        words = f"{closing['holes']:,} holes filled, {closing['skirts']:,} parts on a base, {closing['dropped']:,} left out"
-        rows.append(("closed", words))
+        holes, skirts, dropped = (f"{closing[name]:,}" for name in ("holes", "skirts", "dropped"))
+        rows.append(("closed", f"{holes} holes filled, {skirts} parts on a base, {dropped} parts left out"))
     if simplification := record.get("simplification"):
         rows.append(("simplified from", f"{simplification['triangles_before']:,} triangles"))
     return rows

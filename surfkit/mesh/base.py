@@ -170,4 +170,4 @@ def require_values(mesh: Mesh) -> None:
             raise BadInput(f"values has the name {name!r}; vertices may have {', '.join(VALUES)}")
         if each.dtype != np.float32 or each.shape != (len(mesh.vertices),):
             found = f"{each.dtype} of shape {list(each.shape)}"
-            raise BadInput(f"values.{name} is {found}; give float32 of shape [{len(mesh.vertices)}], one for each vertex")
+            raise BadInput(f"values.{name} is {found}; give float32 of shape [{len(mesh.vertices)}], one a vertex")

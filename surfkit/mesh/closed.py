@@ -1,7 +1,8 @@
 """A closed surface for printing and simulation: every edge has two triangles, which pass it in opposite directions.
 
-The surface is cut where more than two triangles meet (Gueziec, Taubin, Lazarus and Horn, "Cutting and stitching", 2001).
-Its holes are filled; open ground gets walls around its rim, down to a flat base.
+The surface is cut where more than two triangles meet (Gueziec, Taubin, Lazarus and Horn, "Cutting and stitching:
+converting sets of polygons to manifold surfaces", 2001). Its holes are filled; open ground gets walls around its rim,
+down to a flat base.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def open_or_crowded(mesh: Mesh) -> int:
 
 
 def separated(mesh: Mesh) -> Mesh:
-    """The mesh with vertices doubled, so that each edge has two triangles, one each way, or one, and each vertex one fan.
+    """The mesh with vertices doubled, so that an edge has one triangle, or two, one each way, and a vertex one fan.
 
     Where more triangles share an edge, those side by side stay together.
     """
@@ -209,7 +210,8 @@ def _filled(mesh: Mesh, loops: list[np.ndarray], known: np.ndarray) -> Mesh:
         step = max(1, 1_000_000 // length**2)
         for at in range(0, len(alike), step):
             some = np.stack(alike[at : at + step])
-            faces = np.stack([ring[places] for ring, places in zip(some, fill(mesh.vertices[some].astype(np.float64)), strict=True)])
+            places = fill(mesh.vertices[some].astype(np.float64))
+            faces = some[np.arange(len(some))[:, None, None], places]
             flat = areas_of(mesh.vertices, faces.reshape(-1, 3)).reshape(len(some), -1).min(1) <= 0
             bad = _has_known(faces, some, known) | flat
             made.append(faces[~bad].reshape(-1, 3))
@@ -232,12 +234,12 @@ def _fanned(mesh: Mesh, loops: list[np.ndarray]) -> Mesh:
     sizes, ends = np.array([len(loop) for loop in loops]), np.concatenate(loops)
     following = np.concatenate([np.roll(loop, -1) for loop in loops])
     owner = np.repeat(np.arange(len(loops)), sizes)
-    middles = np.stack([np.bincount(owner, axis) for axis in mesh.vertices[ends].T.astype(np.float64)], 1) / sizes[:, None]
-    colors = None
-    if mesh.colors is not None:
-        colors = np.stack([np.bincount(owner, axis) for axis in mesh.colors[ends].T], 1) / sizes[:, None]
+
+    def mean(rows: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(owner, column) for column in rows[ends].T], 1) / sizes[:, None]
+
     first = len(mesh.vertices)
-    mesh = _with_vertices(mesh, middles, colors)
+    mesh = _with_vertices(mesh, mean(mesh.vertices), None if mesh.colors is None else mean(mesh.colors))
     return replace(
         mesh, faces=np.concatenate([mesh.faces, np.stack([ends, following, first + owner], 1)]).astype(np.int32)
     )

@@ -64,7 +64,7 @@ def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 
 
 def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
-    """OBJ with colours after the coordinates, as MeshLab, CloudCompare and Blender read them; it has no place for values."""
+    """OBJ with colours after the coordinates, as MeshLab, CloudCompare and Blender read them; values have no place."""
     file.write("".join(f"# {note}\n" for note in notes(frame)).encode())
     decimals = max(0, 6 - int(np.floor(np.log10(1 / frame.scale))))
     place = " ".join([f"%.{decimals}f"] * 3)
@@ -143,9 +143,7 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
 
 def in_files(mesh: Mesh, frame: Frame) -> dict[str, np.ndarray]:
     """(V,) float32 values of the vertices by name, lengths in units of the input."""
-    return {
-        name: (each / frame.scale if name in LENGTHS else each).astype("<f4") for name, each in mesh.values.items()
-    }
+    return {name: (each / frame.scale if name in LENGTHS else each).astype("<f4") for name, each in mesh.values.items()}
 
 
 def notes(frame: Frame) -> list[str]:

@@ -124,9 +124,7 @@ def from_above(mesh: Mesh, up: np.ndarray, longest: int, colors: np.ndarray | No
     return _lit(mesh, far, (places, width, height), colors)
 
 
-def _lit(
-    mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int], colors: np.ndarray | None = None
-) -> Tensor:
+def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int], colors: np.ndarray | None = None) -> Tensor:
     """The picture of a mesh from its vertices in the camera's frame, and where they lie on the picture."""
     places, width, height = drawn
     _, face = draw_faces(places, mesh.faces, width, height)

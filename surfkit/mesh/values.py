@@ -11,7 +11,7 @@ WARM_TO_COOL = np.array([[190, 30, 45], [240, 130, 60], [250, 215, 120], [130, 1
 UNKNOWN = 128
 """Grey of vertices whose value is not known."""
 VIEWS = (1.0, 10.0)
-"""Photographs at the ends of the colours; a tenth adds little. The same for all meshes, so that they can be compared."""
+"""Photographs at the ends of the colours, the same for all meshes: they can be compared."""
 PERCENTILES = (2, 98)
 """Of lengths, at the ends of the colours."""
 

@@ -66,8 +66,8 @@ class MeshOutput:
     does not say how long these are. One place of a hundred may move farther."""
 
     watertight: bool = False
-    """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets walls
-    and a flat base. Small loose sheets are left out."""
+    """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets
+    walls and a flat base. Small loose sheets are left out."""
 
     clusters: int = 50
     """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""
@@ -191,7 +191,6 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     forget_spooled(run.out)
     raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
     facts = plain_facts(maker_of(run, mesher), raw)
-    require_values(raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     least = delivery.clusters, delivery.least_triangles
     mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
@@ -229,13 +228,14 @@ def maker_of(run: Run, mesher: Mesher | Mesh) -> str:
 
 
 def plain_facts(maker: str, mesh: Mesh) -> dict[str, Any]:
-    """The facts that come with a mesh; BadInput, which names what made it, if they cannot be written to JSON."""
+    """The facts that come with a mesh; BadInput, which names what made it, if these or its values cannot be written."""
     facts = {} if mesh.facts is None else mesh.facts
     facts = dict(facts) if isinstance(facts, Mapping) else facts
     try:
         if not isinstance(facts, dict):
             raise BadInput(f"facts is a {type(facts).__name__}, not a dict")
         require_plain(facts, "facts")
+        require_values(mesh)
     except BadInput as error:
         raise BadInput(f"{maker}: {error}") from error
     return facts

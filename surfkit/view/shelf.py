@@ -103,7 +103,8 @@ class Shelf:
         frame, mesh = self.subject.frame, self.mesh(budget)
         ends = self._ends(value)
         shown = (ends[0] / frame.scale, ends[1] / frame.scale) if value in LENGTHS else ends
-        return replace(mesh, colors=by_value(value, mesh.values[value], ends)), words_of(value, shown, length_unit(frame))
+        painted = replace(mesh, colors=by_value(value, mesh.values[value], ends))
+        return painted, words_of(value, shown, length_unit(frame))
 
     def _ends_of(self, value: str) -> tuple[float, float]:
         assert self.subject.mesh is not None

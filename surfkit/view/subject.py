@@ -270,9 +270,7 @@ def local_mesh(surface: Surface, frame: Frame, colors: np.ndarray | None = None)
 def values_of(surface: Surface, frame: Frame) -> dict[str, np.ndarray]:
     """(V,) float32 values of the vertices of a PLY file by name, see `VALUES`; lengths in local units."""
     there = [name for name in VALUES if name in (surface.rows.dtype.names or ())]
-    return {
-        name: (surface.rows[name] * (frame.scale if name in LENGTHS else 1.0)).astype(np.float32) for name in there
-    }
+    return {name: (surface.rows[name] * (frame.scale if name in LENGTHS else 1.0)).astype(np.float32) for name in there}
 
 
 def colors_of(surface: Surface) -> np.ndarray | None:

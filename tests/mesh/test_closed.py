@@ -46,7 +46,7 @@ def ground(side=20, gone=()):
 
 @pytest.mark.parametrize("kind", ["ply", "glb"])
 def test_open_ground_gets_walls_and_a_base(tmp_path, kind):
-    """With a large hole, and two small ones that are one as they touch; against the volume between the ground and its base."""
+    """With a large hole, and two small ones that touch, so are one; against the volume down to the base."""
     gone = {(3, 3), (4, 4), *((i, j) for i in range(8, 18) for j in range(8, 18))}
     mesh, done = closed(ground(gone=gone), UP)
     found = read(mesh, tmp_path, kind)
