@@ -37,6 +37,7 @@ from surfkit.scene.crop import Crop, box, read_crop
 from surfkit.scene.lengths import unit_of
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, Scene, View
+from surfkit.scene.up_direction import up_direction, up_of_views
 
 SHOWN = 4
 """Training views that pictures are made of."""
@@ -58,8 +59,8 @@ class MeshOutput:
     """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
 
     triangles: int | None = None
-    """Simplify the mesh to at most this many triangles, in the order in which they matter least; flat places get large
-    ones. With `--error`, it ends at whichever comes first."""
+    """Simplify the mesh to at most this many triangles; flat places get large ones. Parts and holes stay: where they need
+    more, a line says so. With `--error`, it ends at whichever comes first."""
 
     error: float | None = None
     """Simplify the mesh until its surface would move by more than about this: metres, or units of the data set where it
@@ -253,7 +254,7 @@ def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh
     frame = subject.frame
     if delivery.watertight:
         emit(Progress("closing", 0, 1))
-        up = up_of(mesh, [view.camera for view in subject.views])
+        up = upright(mesh, subject)
         mesh, closing = closed(mesh, up)
         emit(Progress("closing", 1, 1))
         base = None if closing.base is None else float(frame.to_input(closing.base * up) @ up)
@@ -267,9 +268,17 @@ def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh
         emit(Progress("simplifying", 1, 1))
         done["simplification"] = {"triangles_before": before, "triangles": len(mesh.faces)}
         if delivery.triangles is not None and len(mesh.faces) > delivery.triangles:
-            why = "no further edge can be collapsed" if delivery.error is None else "further ones would move it too far"
+            why = "its parts and holes need them; --cluster-gap 0 and --hole-edges leave fewer of these"
+            why = why if delivery.error is None else "fewer would move it farther than --error"
             emit(Warned(f"--triangles {delivery.triangles}: {len(mesh.faces):,} are left, as {why}"))
     return mesh, done
+
+
+def upright(mesh: Mesh, subject: MeshInput) -> np.ndarray:
+    """(3,) the direction that is up: of a map, or as the cameras are held; where these do not tell, as of pictures."""
+    if up_of_views(subject.views, subject.frame) is None:
+        return up_of(mesh, [view.camera for view in subject.views])
+    return up_direction(None, subject.views, subject.frame, np.eye(4)).direction
 
 
 def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Mesh]]:

@@ -88,26 +88,33 @@ public:
         for (int64_t c = 3 * job.face_count - 1; c >= 0; c--) next_[c] = head_[faces_[c]], head_[faces_[c]] = (int32_t)c;
         for (int64_t v = 0; v < job.vertex_count; v++) parent_[v] = (int32_t)v;
         find_planes();
-        for (int32_t u = 0; u < job.vertex_count; u++) {
+    }
+
+    Collapsed run() {
+        collapse_all();
+        thin_too_ = std::isinf(job_.limit);  // where only the number counts, it is worth thin triangles
+        if (thin_too_ && left_ > job_.least) collapse_all();
+        return result();
+    }
+
+private:
+    void collapse_all() {
+        heap_.clear();
+        for (int32_t u = 0; u < job_.vertex_count; u++) {
             neighbours(u, around_);
             for (const Neighbour& n : around_)
                 if (n.vertex > u) look_at(u, n.vertex);
         }
         std::make_heap(heap_.begin(), heap_.end(), later);
-        live_ = heap_.size();
-    }
-
-    Collapsed run() {
+        live_ = std::max<size_t>(heap_.size(), 1024);
         while (left_ > job_.least && !heap_.empty()) {
             std::pop_heap(heap_.begin(), heap_.end(), later);
             const Edge edge = heap_.back();
             heap_.pop_back();
             if (is_now(edge)) try_collapse(edge.u, edge.v);
         }
-        return result();
     }
 
-private:
     Point place(int32_t v) const { return {places_[3 * (int64_t)v], places_[3 * (int64_t)v + 1], places_[3 * (int64_t)v + 2]}; }
     bool is_now(const Edge& e) const { return changes_[e.u] + changes_[e.v] == e.stamp; }
 
@@ -256,7 +263,7 @@ private:
             const double rest = dot(to_d - to_b, to_d - to_b);
             const double old_long = std::max({dot(to_b - from, to_b - from), dot(to_d - from, to_d - from), rest});
             const double longest = std::max({dot(to_b - p, to_b - p), dot(to_d - p, to_d - p), rest});
-            const bool thin = size < kThin * longest && size * old_long < old_size * longest;
+            const bool thin = !thin_too_ && size < kThin * longest && size * old_long < old_size * longest;
             found = thin || dot(before, now) < kTurn * old_size * size;
         });
         return found;
@@ -341,6 +348,7 @@ private:
     std::vector<Neighbour> around_, beyond_;
     int64_t left_;
     size_t live_ = 0;
+    bool thin_too_ = false;
 };
 
 }  // namespace
