@@ -24,6 +24,8 @@ MARGIN = 0.02
 """By how much the base lies below the lowest point, as a share of the width of the mesh."""
 APART = 0.01
 """By how much vertices in one place are moved apart, as a share of the way to their neighbours."""
+FINEST = 2.0**-20
+"""Places that are nearer than this are one, as a share of the extent."""
 ROUNDS = 20
 """Of moving apart."""
 SCRAP = 0.01
@@ -308,11 +310,14 @@ def _enclosing(mesh: Mesh) -> tuple[Mesh, int, float]:
 def apart(mesh: Mesh) -> Mesh:
     """The mesh with no two vertices in one place: programs that read files make them one, and edges crowded again.
 
-    All but one of those in a place are moved a little towards the middle of their own neighbours.
+    All but one of those in a place, also as files with 32 bits round it, are moved a little towards the middle of their
+    own neighbours.
     """
     vertices = mesh.vertices.copy()
+    low, step = vertices.min(0), max(float(np.ptp(vertices, axis=0).max()) * FINEST, 1e-30)
     for _ in range(ROUNDS):
-        _, first = np.unique(np.ascontiguousarray(vertices + np.float32(0)).view(np.void(12))[:, 0], return_index=True)
+        cells = ((vertices - low) / step).astype(np.int64)
+        _, first = np.unique(cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2], return_index=True)
         double = np.ones(len(vertices), bool)
         double[first] = False
         if not double.any():

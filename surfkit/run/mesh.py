@@ -19,7 +19,7 @@ from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
 from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import Report, clean
-from surfkit.mesh.closed import closed, require_closed
+from surfkit.mesh.closed import apart, closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.shade import from_above, shaded, up_of
@@ -59,8 +59,8 @@ class MeshOutput:
     """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
 
     triangles: int | None = None
-    """Simplify the mesh to at most this many triangles; flat places get large ones. Parts and holes stay: where they need
-    more, a line says so. With `--error`, it ends at whichever comes first."""
+    """Simplify the mesh to at most this many triangles; flat places get large ones. Parts and holes stay: where they
+    need more, a line says so. With `--error`, it ends at whichever comes first."""
 
     error: float | None = None
     """Simplify the mesh until its surface would move by more than about this: metres, or units of the data set where it
@@ -265,6 +265,7 @@ def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh
         if error is not None:
             error = error * frame.scale if frame.local_metres is None else error / frame.local_metres
         mesh = simplified(mesh, delivery.triangles, error)
+        mesh = apart(mesh) if delivery.watertight else mesh
         emit(Progress("simplifying", 1, 1))
         done["simplification"] = {"triangles_before": before, "triangles": len(mesh.faces)}
         if delivery.triangles is not None and len(mesh.faces) > delivery.triangles:
@@ -289,7 +290,8 @@ def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Me
     """
     meshes = [("mesh", mesh)]
     for at, share in enumerate(delivery.lods, 1):
-        meshes.append((f"mesh-lod{at}", simplified(mesh, max(1, round(share * len(mesh.faces))))))
+        less = simplified(mesh, max(1, round(share * len(mesh.faces))))
+        meshes.append((f"mesh-lod{at}", apart(less) if delivery.watertight else less))
         emit(Progress("simplifying", at, len(delivery.lods)))
     if delivery.watertight:  # also as GLB rounds them
         for name, each in meshes:

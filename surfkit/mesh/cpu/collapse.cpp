@@ -133,6 +133,13 @@ private:
         }
     }
 
+    // Triangles of a vertex, and `most` if they are more: the middle of a fan over a large hole has thousands.
+    int corners(int32_t v, int most) const {
+        int count = 0;
+        for (int32_t c = head_[v]; c >= 0 && count < most; c = next_[c]) count += faces_[c] >= 0;
+        return count;
+    }
+
     static int32_t after(int32_t c) { return c % 3 == 2 ? c - 2 : c + 1; }
 
     void neighbours(int32_t v, std::vector<Neighbour>& found) {
@@ -211,6 +218,8 @@ private:
 
     // Whether the surface stays what it is: the edge has one or two triangles, and nothing else connects its ends.
     bool stays_a_surface(int32_t u, int32_t v) {
+        const int most = kMostFaces + 4;  // with the two at the edge, seen from both ends
+        if (corners(u, most + 1) + corners(v, most + 1) > most) return false;
         neighbours(u, around_), neighbours(v, beyond_);
         int shared = 0, common = 0;
         int32_t opposite[2] = {-1, -1};
@@ -238,11 +247,8 @@ private:
         });
         each_corner(v, [&](int32_t c) { faces += faces_[after(c)] != u && faces_[after(after(c))] != u; });
         if (!faces || faces > kMostFaces || closing) return false;
-        for (int k = 0; k < shared; k++) {  // the tip of an ear would go with it
-            int corners = 0;
-            each_corner(opposite[k], [&](int32_t) { corners++; });
-            if (corners < 2) return false;
-        }
+        for (int k = 0; k < shared; k++)
+            if (corners(opposite[k], 2) < 2) return false;  // the tip of an ear, which would go with it
         return true;
     }
 
