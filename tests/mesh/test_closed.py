@@ -8,6 +8,7 @@ from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import apart, closed, open_or_crowded, separated
 from surfkit.mesh.files import write_mesh
+from surfkit.mesh.holes import edges
 from surfkit.scene.scene import Frame
 
 trimesh = needs("trimesh")
@@ -82,6 +83,18 @@ def test_parts_that_touch_are_cut_apart(tmp_path):
     assert len(np.unique(apart(inner).vertices, axis=0)) == 16
 
 
+@pytest.mark.parametrize("quarters", range(4))
+def test_triangles_at_a_crowded_edge_stay_with_those_beside_them(quarters):
+    """Two tetrahedra with an edge in common, one within the wedge of the other: both stay closed."""
+    corners = [[0, 0, 0], [0, 0, 1], [2, 0, 0.5], [0, 2, 0.5], [1, 0.5, 0.4], [0.5, 1, 0.4]]
+    faces = [f for a, b, c, d in ((0, 1, 2, 3), (0, 1, 4, 5)) for f in ((b, a, c), (a, b, d), (c, d, b), (d, c, a))]
+    turned = np.array(faces, np.int32)[:, ::-1]
+    places = np.array(corners, np.float32) @ np.linalg.matrix_power([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], quarters)
+    found = separated(Mesh(places.astype(np.float32), np.ascontiguousarray(turned)))
+    assert len(found.vertices) == 8 and len(edges(found)[1]) == 0
+    assert trimesh.Trimesh(found.vertices, found.faces, process=False).is_watertight
+
+
 def test_what_encloses_nothing_goes():
     ball = as_mesh(trimesh.creation.icosphere(3))
     inside_out = Mesh(0.3 * ball.vertices + np.float32([3, 0, 0]), ball.faces[:, ::-1])
@@ -100,8 +113,10 @@ def test_triangles_that_are_turned_are_closed_too(tmp_path, rng=np.random.defaul
     mesh, _ = closed(Mesh(ball.vertices, faces), UP)
     assert is_solid(read(mesh, tmp_path))
     soup = rng.permuted(np.tile(np.arange(30, dtype=np.int32), (80, 1)), axis=1)[:, :3]
-    mesh, _ = closed(Mesh(rng.normal(size=(30, 3)).astype(np.float32), np.ascontiguousarray(soup)), UP)
-    assert is_solid(read(mesh, tmp_path))
+    crowded = Mesh(rng.normal(size=(30, 3)).astype(np.float32), np.ascontiguousarray(soup))
+    one_way = separated(crowded).faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    assert len(np.unique(one_way, axis=0)) == len(one_way), "no edge is passed twice the same way"
+    assert is_solid(read(closed(crowded, UP)[0], tmp_path))
 
 
 def test_what_is_added_was_seen_by_no_view():

@@ -72,6 +72,8 @@ def test_the_surface_stays_what_it_is():
     solid = trimesh.Trimesh(small.vertices, small.faces, process=False)
     assert solid.is_watertight and solid.euler_number == 0 and 14 <= len(small.faces) < 100
     ball = as_mesh(trimesh.creation.icosphere(3))
+    small = simplified(ball, most=1)
+    assert len(small.faces) == 4 and trimesh.Trimesh(small.vertices, small.faces, process=False).is_watertight
     other = ball.faces + len(ball.vertices)
     top, low = int(ball.vertices[:, 2].argmax()), int(ball.vertices[:, 2].argmin())
     other[other == len(ball.vertices) + low] = top
@@ -96,7 +98,7 @@ def test_colours_and_values_are_means_of_what_a_vertex_stands_for():
     x = ground.vertices[:, 0]
     colors = np.stack([40 * x, 0 * x, 255 + 0 * x], 1).astype(np.uint8)
     error = x.copy()
-    error[:100] = np.nan  # not known
+    error[::3] = np.nan  # not known
     ground = Mesh(ground.vertices, ground.faces, colors, {"a": 1}, {"views": x.copy(), "error": error})
     small = simplified(ground, error=0.005)
     assert small.facts == {"a": 1} and len(small.faces) < len(ground.faces) / 2

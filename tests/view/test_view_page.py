@@ -313,6 +313,8 @@ def test_a_mesh_is_coloured_by_what_is_known_of_it(tmp_path, colored):
         shelf = Shelf(subject)
         low, middle, high = shelf.mesh_by("views", 9)[0].colors.astype(int)
         assert low[0] > low[2] + 100 and high[2] > high[0] + 100 and abs(middle[0] - middle[2]) < 150
+        small, _, large = shelf.mesh_by("error", 9)[0].colors.astype(int)
+        assert large[0] > large[2] + 100 and small[2] > small[0] + 100
         assert shelf.mesh_by("error", 9)[1] == "error: blue 1.04 m or less, red 2.96 m or more, grey not known"
         browser = Browser(found.url)
         browser.wait_for(Browser.is_whole)
