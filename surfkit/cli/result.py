@@ -182,7 +182,7 @@ def _finishing_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
     rows = []
     if closing := record.get("closing"):
         holes, skirts, dropped = (f"{closing[name]:,}" for name in ("holes", "skirts", "dropped"))
-        rows.append(("closed", f"{holes} holes filled, {skirts} parts on a base, {dropped} parts left out"))
+        rows.append(("closed", f"{holes} holes filled, {skirts} parts on a base, {dropped} loose parts left out"))
     if simplification := record.get("simplification"):
         rows.append(("simplified from", f"{simplification['triangles_before']:,} triangles"))
     return rows

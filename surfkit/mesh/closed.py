@@ -45,6 +45,7 @@ class Closing:
         skirts: Parts of open ground that got walls and a base.
         base: Height of the base along the direction that is up, local units; None without skirts.
         dropped: Parts that were left out: small open ones, and those that enclose nothing or are inside out.
+        dropped_triangles: That these had.
         volume: That is enclosed, local units cubed.
     """
 
@@ -54,6 +55,7 @@ class Closing:
     skirts: int
     base: float | None
     dropped: int
+    dropped_triangles: int
     volume: float
 
 
@@ -85,9 +87,10 @@ def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
         base = float(heights.min() - MARGIN * np.ptp(across, axis=0).max())
         mesh = _on_base(mesh, rims, up, base)
     mesh, empty, volume = _enclosing(mesh)
+    dropped = scraps[0] + empty[0], scraps[1] + empty[1]
     mesh = apart(mesh)
     require_closed(mesh)
-    return mesh, Closing(cut, len(holes), max(map(len, holes), default=0), len(rims), base, scraps + empty, volume)
+    return mesh, Closing(cut, len(holes), max(map(len, holes), default=0), len(rims), base, *dropped, volume)
 
 
 def require_closed(mesh: Mesh, name: str = "the mesh") -> None:
@@ -164,8 +167,8 @@ def _part_of_vertices(mesh: Mesh) -> np.ndarray:
     return connected_components(links, directed=False)[1]
 
 
-def _without_scraps(mesh: Mesh) -> tuple[Mesh, int]:
-    """The mesh without open parts that are small beside the largest part, and how many they were.
+def _without_scraps(mesh: Mesh) -> tuple[Mesh, tuple[int, int]]:
+    """The mesh without open parts that are small beside the largest part, and how many parts and triangles they were.
 
     They are loose sheets, which would become columns on the base, or thin as paper.
     """
@@ -175,7 +178,8 @@ def _without_scraps(mesh: Mesh) -> tuple[Mesh, int]:
     is_open = np.zeros(len(areas), bool)
     is_open[parts[edges(mesh)[1][:, 0]]] = True
     scraps &= is_open
-    return _of_faces(mesh, ~scraps[parts[mesh.faces[:, 0]]]), int(scraps.sum())
+    stays = ~scraps[parts[mesh.faces[:, 0]]]
+    return _of_faces(mesh, stays), (int(scraps.sum()), int((~stays).sum()))
 
 
 def _of_faces(mesh: Mesh, stays: np.ndarray) -> Mesh:
@@ -295,8 +299,8 @@ def _on_base(mesh: Mesh, rims: list[np.ndarray], up: np.ndarray, base: float) ->
     return replace(mesh, faces=np.concatenate(faces).astype(np.int32))
 
 
-def _enclosing(mesh: Mesh) -> tuple[Mesh, int, float]:
-    """The parts of a closed mesh that enclose something, how many others there were, and what is enclosed."""
+def _enclosing(mesh: Mesh) -> tuple[Mesh, tuple[int, int], float]:
+    """The parts of a closed mesh that enclose something, how many parts and triangles others were, and the volume."""
     parts = _part_of_vertices(mesh)[mesh.faces[:, 0]]
     middle = mesh.vertices.mean(0, dtype=np.float64)
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] - middle for corner in range(3))
@@ -304,7 +308,8 @@ def _enclosing(mesh: Mesh) -> tuple[Mesh, int, float]:
     stays = volumes > 0
     if not stays.any():
         raise BadInput("the mesh cannot be closed: none of its parts encloses anything")
-    return _of_faces(mesh, stays[parts]), int((~stays).sum()), float(volumes[stays].sum())
+    gone = int((~stays).sum()), int((~stays[parts]).sum())
+    return _of_faces(mesh, stays[parts]), gone, float(volumes[stays].sum())
 
 
 def apart(mesh: Mesh) -> Mesh:

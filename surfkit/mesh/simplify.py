@@ -12,7 +12,7 @@ from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
 from surfkit.native import module
 
-SPARE = 9.0
+SPARE = 6.0
 """What a collapse may cost, in squares of the length that is allowed: then 99 of 100 places stay within it."""
 
 

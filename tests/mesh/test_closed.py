@@ -100,7 +100,8 @@ def test_what_encloses_nothing_goes():
     inside_out = Mesh(0.3 * ball.vertices + np.float32([3, 0, 0]), ball.faces[:, ::-1])
     scrap = Mesh(0.01 * ground(2).vertices + np.float32([0, 3, 0]), ground(2).faces)
     mesh, done = closed(joined(ball, inside_out, scrap), UP)
-    assert done.dropped == 2 and len(mesh.faces) == len(ball.faces)
+    assert (done.dropped, done.dropped_triangles) == (2, len(ball.faces) + 8)
+    assert len(mesh.faces) == len(ball.faces)
     with pytest.raises(BadInput, match="none of its parts encloses anything"):
         closed(inside_out, UP)
 
