@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from surfkit.mesh.shade import OPEN
 from surfkit.mesh.simplify import collapsed, require_kernels
 
 MOST_EDGES = 64
-"""Edges of holes that are filled with the least area; larger ones get a fan about their middle."""
+"""Edges of holes that are filled with the least area; from larger ones, ears are cut until they have as few."""
 MARGIN = 0.02
 """By how much the base lies below the lowest point, as a share of the width of the mesh."""
 APART = 0.01
@@ -206,9 +207,11 @@ def _rims(mesh: Mesh, loops: list[np.ndarray], up: np.ndarray) -> set[int]:
 def _filled(mesh: Mesh, loops: list[np.ndarray], known: np.ndarray) -> Mesh:
     """The mesh with loops of open edges filled; `known` are the names of its edges, see `edges`."""
     by_length: dict[int, list[np.ndarray]] = {}
-    for loop in loops:
-        by_length.setdefault(len(loop), []).append(loop)
     made, fans = [], []
+    for loop in loops:
+        ears, rest = _without_ears(mesh.vertices, loop, known)
+        made.append(ears)
+        by_length.setdefault(len(rest), []).append(rest)
     for length, alike in by_length.items():
         if length > MOST_EDGES:
             fans += alike
@@ -224,6 +227,41 @@ def _filled(mesh: Mesh, loops: list[np.ndarray], known: np.ndarray) -> Mesh:
             fans += list(some[bad])
     mesh = replace(mesh, faces=np.concatenate([mesh.faces, *made]).astype(np.int32))
     return _fanned(mesh, fans) if fans else mesh
+
+
+def _without_ears(vertices: np.ndarray, loop: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 3) triangles on two edges of a loop each, the shortest third side first, and the loop that is left.
+
+    That has `MOST_EDGES`, or more where all third sides are edges of the mesh already.
+    """
+    if len(loop) <= MOST_EDGES:
+        return np.empty((0, 3), np.int64), loop
+    places, count = vertices[loop].astype(np.float64), len(loop)
+    before, after = [*range(-1, count - 1)], [*range(1, count), 0]
+    before[0] = count - 1
+
+    def ear(at: int) -> tuple[float, int, int, int]:
+        a, c = before[at], after[at]
+        return float(((places[a] - places[c]) ** 2).sum()), at, a, c
+
+    heap, ears, gone, left = [ear(at) for at in range(count)], [], np.zeros(count, bool), count
+    heapify(heap)
+    while heap and left > MOST_EDGES:
+        _, at, a, c = heappop(heap)
+        if gone[at] or (before[at], after[at]) != (a, c):
+            continue
+        low, high = sorted((int(loop[a]), int(loop[c])))
+        name = low << 32 | high
+        found = int(np.searchsorted(known, name))
+        if (found < len(known) and known[found] == name) or not np.cross(
+            places[at] - places[a], places[c] - places[a]
+        ).any():
+            continue
+        ears.append((loop[a], loop[at], loop[c]))
+        gone[at], after[a], before[c], left = True, c, a, left - 1
+        heappush(heap, ear(a))
+        heappush(heap, ear(c))
+    return np.array(ears, np.int64).reshape(-1, 3), loop[~gone]
 
 
 def _has_known(faces: np.ndarray, loops: np.ndarray, known: np.ndarray) -> np.ndarray:

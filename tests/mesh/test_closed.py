@@ -120,6 +120,20 @@ def test_triangles_that_are_turned_are_closed_too(tmp_path, rng=np.random.defaul
     assert is_solid(read(closed(crowded, UP)[0], tmp_path))
 
 
+def test_a_large_hole_is_spanned_from_its_rim():
+    """124 edges in a plane that is not level: what spans them lies in it, and reaches over all of it, once."""
+    gone = {(i, j) for i in range(4, 36) for j in range(4, 34)}
+    bare = ground(40, gone)
+    bare.vertices[:, 2] = 0.3 * bare.vertices[:, 0]
+    mesh, done = closed(bare, UP)
+    found = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert is_solid(found) and (done.holes, done.largest_hole) == (1, 124)
+    top = found.face_normals[:, 2] > 0.5
+    assert found.area_faces[top].sum() == pytest.approx(4 * np.hypot(1, 0.3), rel=1e-4)
+    middle = found.triangles_center[top]
+    assert np.abs(middle[:, 2] - 0.3 * middle[:, 0]).max() < 1e-5
+
+
 def test_what_is_added_was_seen_by_no_view():
     bare = ground(gone={(5, 5)})
     count = len(bare.vertices)
