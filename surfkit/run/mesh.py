@@ -293,10 +293,11 @@ def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Me
         less = simplified(mesh, max(1, round(share * len(mesh.faces))))
         meshes.append((f"mesh-lod{at}", apart(less) if delivery.watertight else less))
         emit(Progress("simplifying", at, len(delivery.lods)))
-    if delivery.watertight:  # also as GLB rounds them
-        for name, each in meshes:
-            for places in (each.vertices, frame.to_file(each.vertices).astype(np.float32)):
-                require_closed(replace(each, vertices=places), name)
+    for name, each in meshes if delivery.watertight else ():
+        require_closed(each, name)
+        if "glb" in delivery.formats:  # which rounds places to 32 bits
+            rounded = replace(each, vertices=frame.to_file(each.vertices).astype(np.float32))
+            require_closed(rounded, f"{name}.glb")
     return meshes
 
 
