@@ -358,7 +358,7 @@ def apart(mesh: Mesh) -> Mesh:
     """
     vertices = mesh.vertices.copy()
     low, step = vertices.min(0), max(float(np.ptp(vertices, axis=0).max()) * FINEST, 1e-30)
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
         cells = ((vertices - low) / step).astype(np.int64)
         _, first = np.unique(cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2], return_index=True)
         double = np.ones(len(vertices), bool)
@@ -372,6 +372,11 @@ def apart(mesh: Mesh) -> Mesh:
             np.add.at(counts, corners[:, one], 1)
             np.add.at(towards, corners[:, other], vertices[corners[:, one]])
             np.add.at(counts, corners[:, other], 1)
-        middle = towards[double] / counts[double, None]
-        vertices[double] += (APART * (middle - vertices[double])).astype(np.float32)
+        way = towards[double] / counts[double, None] - vertices[double]
+        lengths = np.linalg.norm(way, axis=1)
+        way[lengths == 0] = [1, 0, 0]
+        # where triangles are tiny, farther each time, and not all as far
+        least = step * (1 + turn) * (1 + np.flatnonzero(double) % 8)
+        share = np.maximum(APART, least / np.where(lengths > 0, lengths, 1))
+        vertices[double] += (share[:, None] * way).astype(np.float32)
     return replace(mesh, vertices=vertices)

@@ -83,6 +83,14 @@ def test_parts_that_touch_are_cut_apart(tmp_path):
     assert len(np.unique(apart(inner).vertices, axis=0)) == 16
 
 
+def test_tiny_parts_in_one_place_come_apart():
+    """So small that a hundredth of their size is lost in 32 bits."""
+    solid = as_mesh(trimesh.creation.icosphere(0))
+    tiny = Mesh(np.float32(1) + np.float32(2e-7) * solid.vertices, solid.faces)
+    mesh = joined(Mesh(solid.vertices, solid.faces), *[tiny] * 5)
+    assert open_or_crowded(mesh) >= 30 and open_or_crowded(apart(mesh)) == 0
+
+
 @pytest.mark.parametrize("quarters", range(4))
 def test_triangles_at_a_crowded_edge_stay_with_those_beside_them(quarters):
     """Two tetrahedra with an edge in common, one within the wedge of the other: both stay closed."""
