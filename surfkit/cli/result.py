@@ -170,14 +170,15 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
     """What mesh.json says of a mesh: its size, and whatever facts its mesher gives."""
     cleaning, facts = record["cleaning"], record.get("facts", record.get("lengths", {}))  # so called by older versions
     return [
-        ("triangles", f"{cleaning['triangles']:,}"),
-        ("vertices", f"{cleaning['vertices']:,}"),
+        ("triangles", f"{record.get('triangles', cleaning['triangles']):,}"),
+        ("vertices", f"{record.get('vertices', cleaning['vertices']):,}"),
         ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
         (
             "edges of holes and rims",
             f"{cleaning['boundary_share']:.1%} of all edges, in {cleaning['boundaries']:,} loops",
         ),
         *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
+        *_finishing_rows(record),
         *(
             (in_words(name.replace("_", " ")), in_words(value))
             for name, value in facts.items()
@@ -185,6 +186,17 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("seconds", f"{record['seconds']:.1f}"),
     ]
+
+
+def _finishing_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """What was done to a mesh after it was cleaned."""
+    rows = []
+    if closing := record.get("closing"):
+        holes, skirts, dropped = (f"{closing[name]:,}" for name in ("holes", "skirts", "dropped"))
+        rows.append(("closed", f"{holes} holes filled, {skirts} parts on a base, {dropped} loose parts left out"))
+    if simplification := record.get("simplification"):
+        rows.append(("simplified from", f"{simplification['triangles_before']:,} triangles"))
+    return rows
 
 
 def compressed_rows(record: dict[str, Any], metrics: dict[str, Any] | None) -> list[tuple[str, str, str]]:

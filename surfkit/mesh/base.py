@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,13 @@ from surfkit.scene.scene import Frame, View
 
 MOST_LEVELS = 50
 """Lists and dicts within one another that facts may have."""
+VALUES = {
+    "views": "photographs that confirm the surface there",
+    "error": "by how much the surface may be wrong there, a length",
+}
+"""Names that values of vertices may have, and what they mean."""
+LENGTHS = frozenset({"error"})
+"""Those that are lengths: in local units in memory, in units of the data set in files."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +39,26 @@ class Mesh:
         colors: (V, 3) uint8, or None.
         facts: How it was made, such as the values of automatic settings: any plain values, see `require_plain`, written
             to mesh.json and shown to the user.
+        values: (V,) float32 numbers of the vertices by name, see `VALUES`; lengths in local units. Every step carries
+            them: a vertex that stands for several has their mean.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def take(self, rows: np.ndarray, faces: np.ndarray) -> Mesh:
+        """A mesh of some of its vertices, with what belongs to them.
+
+        Args:
+            rows: Numbers of the vertices, or a (V,) mask.
+            faces: (F, 3) int32 places in `rows`.
+        """
+        colors = None if self.colors is None else self.colors[rows]
+        values = {name: each[rows] for name, each in self.values.items()}
+        return replace(self, vertices=self.vertices[rows], faces=faces, colors=colors, values=values)
 
 
 @dataclass(frozen=True)
@@ -140,3 +161,13 @@ def require_plain(value: Any, at: str, levels: int = MOST_LEVELS) -> None:
         if isinstance(value, dict) and not isinstance(key, str):
             raise BadInput(f"{at} has the key {key!r} ({type(key).__name__}), which is not text")
         require_plain(item, f"{at}.{key}", levels - 1)
+
+
+def require_values(mesh: Mesh) -> None:
+    """BadInput unless the values of the vertices have names that are known, and there is a number for each vertex."""
+    for name, each in mesh.values.items():
+        if name not in VALUES:
+            raise BadInput(f"values has the name {name!r}; vertices may have {', '.join(VALUES)}")
+        if each.dtype != np.float32 or each.shape != (len(mesh.vertices),):
+            found = f"{each.dtype} of shape {list(each.shape)}"
+            raise BadInput(f"values.{name} is {found}; give float32 of shape [{len(mesh.vertices)}], one a vertex")

@@ -170,11 +170,10 @@ def _referenced(mesh: Mesh) -> Mesh:
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     place = (np.cumsum(used) - 1).astype(np.int32)
-    colors = None if mesh.colors is None else mesh.colors[used]
-    return replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], colors=colors)
+    return mesh.take(used, place[mesh.faces])
 
 
 def _welded(mesh: Mesh) -> Mesh:
-    """The mesh with vertices in the same place made one; the first of them gives the colour."""
+    """The mesh with vertices in the same place made one; the first of them gives colour and values."""
     stands_for = first_in_place(mesh.vertices)
     return mesh if stands_for is None else _referenced(replace(mesh, faces=stands_for[mesh.faces]))

@@ -17,8 +17,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.export.glb import MOST_BYTES, SHORT, linear_colors
-from surfkit.mesh.base import Mesh
+from surfkit.export.glb import FLOAT, MOST_BYTES, SHORT, linear_colors
+from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.scene.scene import Frame
 
 Format = Literal["ply", "obj", "glb"]
@@ -39,10 +39,12 @@ def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
 
 
 def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
-    """Binary PLY with double coordinates."""
+    """Binary PLY with double coordinates; values of the vertices are properties of their names."""
     layout = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
     layout += [(name, "u1") for name in ("red", "green", "blue")] if mesh.colors is not None else []
-    kinds = {"<f8": "double", "u1": "uchar"}
+    layout += [(name, "<f4") for name in mesh.values]
+    kinds = {"<f8": "double", "u1": "uchar", "<f4": "float"}
+    values = in_files(mesh, frame)
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {note}" for note in notes(frame))]
     header += [f"element vertex {len(mesh.vertices)}", *(f"property {kinds[kind]} {name}" for name, kind in layout)]
     header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
@@ -52,6 +54,8 @@ def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
         rows["x"], rows["y"], rows["z"] = frame.to_file(mesh.vertices[at : at + CHUNK]).T
         if mesh.colors is not None:
             rows["red"], rows["green"], rows["blue"] = mesh.colors[at : at + CHUNK].T
+        for name, each in values.items():
+            rows[name] = each[at : at + CHUNK]
         file.write(rows.tobytes())
     for at in range(0, len(mesh.faces), CHUNK):
         rows = np.empty(len(mesh.faces[at : at + CHUNK]), [("count", "u1"), ("at", "<i4", 3)])
@@ -60,7 +64,7 @@ def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 
 
 def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
-    """OBJ with colours after the coordinates, as MeshLab, CloudCompare and Blender read them."""
+    """OBJ with colours after the coordinates, as MeshLab, CloudCompare and Blender read them; values have no place."""
     file.write("".join(f"# {note}\n" for note in notes(frame)).encode())
     decimals = max(0, 6 - int(np.floor(np.log10(1 / frame.scale))))
     place = " ".join([f"%.{decimals}f"] * 3)
@@ -79,6 +83,8 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     """GLB, and NAME.glb.json, which names the offset. Colours are linear, as glTF has them.
 
+    Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore.
+
     Raises:
         BadInput: More than 4 GiB.
     """
@@ -96,6 +102,12 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
         accessors.append({"componentType": SHORT, "normalized": True, "type": "VEC4"})
         counts.append(len(places))
         attributes["COLOR_0"] = 2
+    for name, each in in_files(mesh, frame).items():
+        attributes[f"_{name.upper()}"] = len(parts)
+        parts.append(each.tobytes())
+        views.append({"target": 34962, "byteStride": 4})
+        accessors.append({"componentType": FLOAT, "type": "SCALAR"})
+        counts.append(len(places))
     starts = np.cumsum([0, *map(len, parts)]).tolist()
     node = {"mesh": 0} | ({"matrix": UP} if frame.crs else {})
     document = {
@@ -127,6 +139,11 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     up = "y: the file turns z up to y up" if frame.crs else "as in the input"
     write_json(beside, {"offset": list(frame.shift), "metres_per_unit": frame.metres, "crs": frame.crs, "up": up})
     return [Path(path), beside]
+
+
+def in_files(mesh: Mesh, frame: Frame) -> dict[str, np.ndarray]:
+    """(V,) float32 values of the vertices by name, lengths in units of the input."""
+    return {name: (each / frame.scale if name in LENGTHS else each).astype("<f4") for name, each in mesh.values.items()}
 
 
 def notes(frame: Frame) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -39,7 +40,7 @@ def drop_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: 
         seen += np.bincount(part[at], np.abs(beyond) <= reach, len(sizes))
         through += np.bincount(part[at], beyond > reach, len(sizes))
     stays = through <= ratio * seen
-    return Mesh(mesh.vertices, mesh.faces[stays[labels]], mesh.colors, mesh.facts), int((~stays).sum())
+    return replace(mesh, faces=mesh.faces[stays[labels]]), int((~stays).sum())
 
 
 def _beyond(points: np.ndarray, picture: Picture) -> tuple[np.ndarray, np.ndarray]:

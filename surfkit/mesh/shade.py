@@ -101,8 +101,15 @@ def shaded(mesh: Mesh, camera: Camera) -> Tensor:
     return _lit(mesh, local, (places, camera.width, camera.height))
 
 
-def from_above(mesh: Mesh, up: np.ndarray, longest: int) -> Tensor:
-    """(3, H, W) in [0, 1]: the mesh in grey, seen against the direction `up`, without perspective."""
+def from_above(mesh: Mesh, up: np.ndarray, longest: int, colors: np.ndarray | None = None) -> Tensor:
+    """(3, H, W) in [0, 1]: the mesh, seen against the direction `up`, without perspective.
+
+    Args:
+        mesh: Any.
+        up: (3,) unit vector.
+        longest: Side of the picture, pixels.
+        colors: (V, 3) uint8 of the vertices; the mesh is grey, and blue from behind, where there are none.
+    """
     across = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
     across /= np.linalg.norm(across)
     turn = np.stack([-across, np.cross(-up, -across), -up])  # x to the right, y down, z away from the eye
@@ -114,10 +121,10 @@ def from_above(mesh: Mesh, up: np.ndarray, longest: int) -> Tensor:
     deep = local[:, 2] - local[:, 2].min() + 1e3 * max(np.ptp(local[:, 2]), 1e-12)  # nearly parallel rays
     places = np.concatenate([(local[:, :2] - low) * scale, deep[:, None]], axis=1)
     far = local + [0, 0, 1e6 * (1 + np.abs(local).max())]  # from an eye far away
-    return _lit(mesh, far, (places, width, height))
+    return _lit(mesh, far, (places, width, height), colors)
 
 
-def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int]) -> Tensor:
+def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int], colors: np.ndarray | None = None) -> Tensor:
     """The picture of a mesh from its vertices in the camera's frame, and where they lie on the picture."""
     places, width, height = drawn
     _, face = draw_faces(places, mesh.faces, width, height)
@@ -130,7 +137,10 @@ def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int]) -> T
     behind = (normals * (a + b + c)).sum(1) > 0
     grey = 0.25 + 0.7 * np.abs(light)
     image = np.full((height, width, 3), BACKGROUND)
-    image[there] = np.where(behind[:, None], grey[:, None] * [0.55, 0.7, 1.0], grey[:, None])
+    if colors is None:
+        image[there] = np.where(behind[:, None], grey[:, None] * [0.55, 0.7, 1.0], grey[:, None])
+    else:
+        image[there] = grey[:, None] * colors[mesh.faces[face[there]]].mean(1) / 255
     return torch.from_numpy(image).float().permute(2, 0, 1)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
@@ -16,13 +17,15 @@ from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
-from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain
+from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import Report, clean
+from surfkit.mesh.closed import apart, closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.shade import from_above, shaded, up_of
-from surfkit.mesh.simplify import require_simplification, simplify_to
+from surfkit.mesh.simplify import require_kernels, simplified
 from surfkit.mesh.stereo import points
+from surfkit.mesh.values import by_value, ends_of, words_of
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import NEAR
@@ -31,8 +34,10 @@ from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
 from surfkit.run.folder import Run
 from surfkit.scene.crop import Crop, box, read_crop
+from surfkit.scene.lengths import unit_of
 from surfkit.scene.photos import view_photo
-from surfkit.scene.scene import Scene, View
+from surfkit.scene.scene import Frame, Scene, View
+from surfkit.scene.up_direction import up_direction, up_of_views
 
 SHOWN = 4
 """Training views that pictures are made of."""
@@ -52,6 +57,18 @@ class MeshOutput:
 
     lods: tuple[float, ...] = ()
     """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
+
+    triangles: int | None = None
+    """Simplify the mesh to at most this many triangles; flat places get large ones. Parts and holes stay: where they
+    need more, a line says so. With `--error`, it ends at whichever comes first."""
+
+    error: float | None = None
+    """Simplify the mesh until its surface would move by more than about this: metres, or units of the data set where it
+    does not say how long these are. One place of a hundred may move farther."""
+
+    watertight: bool = False
+    """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets
+    walls and a flat base. Small loose sheets are left out."""
 
     clusters: int = 50
     """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""
@@ -87,8 +104,13 @@ class MeshOutput:
             raise BadInput("--formats: name at least one of ply, obj, glb")
         if self.crop is not None and self.crop_box is not None:
             raise BadInput("--crop and --crop-box: give one of the two")
-        if self.lods:
-            require_simplification("--lods")
+        if self.triangles is not None and self.triangles < 4:
+            raise BadInput(f"--triangles {self.triangles}: give 4 or more")
+        if self.error is not None and not 0 < self.error < float("inf"):
+            raise BadInput(f"--error {self.error:g}: it must be more than 0")
+        for name in ("lods", "triangles", "error", "watertight"):
+            if getattr(self, name):
+                require_kernels(f"--{name}")
 
     def volume(self) -> Crop | None:
         """The crop, in the frame of the input."""
@@ -174,8 +196,10 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     least = delivery.clusters, delivery.least_triangles
     mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
     del raw
+    mesh, done = finished(mesh, delivery, subject)
+    meshes = levels(mesh, delivery, frame)
     before = delete_meshes(run)
-    written = list(write_files(run, mesh, delivery, subject))
+    written = list(write_files(run, meshes, delivery, subject))
     if gone := sorted(before - {path.name for path in written}):
         emit(Warned(f"{', '.join(gone)} of the mesh before {'is' if len(gone) == 1 else 'are'} gone"))
     record = {
@@ -184,13 +208,16 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "steps": steps,
         "facts": facts,
         "cleaning": describe(report, subject),
+        **done,
+        "triangles": len(mesh.faces),
+        "vertices": len(mesh.vertices),
         "files": [path.name for path in written],
         "crs": frame.crs,
         "offset": list(frame.shift),
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }
-    write_pictures(run, mesh, subject)
+    record["pictures"] = write_pictures(run, mesh, subject)
     write_json(run.mesh_record, record)
     emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
@@ -202,16 +229,76 @@ def maker_of(run: Run, mesher: Mesher | Mesh) -> str:
 
 
 def plain_facts(maker: str, mesh: Mesh) -> dict[str, Any]:
-    """The facts that come with a mesh; BadInput, which names what made it, if they cannot be written to JSON."""
+    """The facts that come with a mesh; BadInput, which names what made it, if these or its values cannot be written."""
     facts = {} if mesh.facts is None else mesh.facts
     facts = dict(facts) if isinstance(facts, Mapping) else facts
     try:
         if not isinstance(facts, dict):
             raise BadInput(f"facts is a {type(facts).__name__}, not a dict")
         require_plain(facts, "facts")
+        require_values(mesh)
     except BadInput as error:
         raise BadInput(f"{maker}: {error}") from error
     return facts
+
+
+def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh, dict[str, Any]]:
+    """A clean mesh, closed and simplified as is wanted, and what mesh.json says of that.
+
+    It is closed first: what closes it is simplified with it, and simplifying opens nothing.
+
+    Raises:
+        BadInput: It cannot be closed.
+    """
+    done: dict[str, Any] = {}
+    frame = subject.frame
+    if delivery.watertight:
+        emit(Progress("closing", 0, 1))
+        up = upright(mesh, subject)
+        mesh, closing = closed(mesh, up)
+        emit(Progress("closing", 1, 1))
+        base = None if closing.base is None else float(frame.to_input(closing.base * up) @ up)
+        done["closing"] = dump(closing) | {"base": base, "volume": closing.volume / frame.scale**3}
+    if delivery.triangles is not None or delivery.error is not None:
+        emit(Progress("simplifying", 0, 1))
+        before, error = len(mesh.faces), delivery.error
+        if error is not None:
+            error = error * frame.scale if frame.local_metres is None else error / frame.local_metres
+        mesh = simplified(mesh, delivery.triangles, error)
+        mesh = apart(mesh) if delivery.watertight else mesh
+        emit(Progress("simplifying", 1, 1))
+        done["simplification"] = {"triangles_before": before, "triangles": len(mesh.faces)}
+        if delivery.triangles is not None and len(mesh.faces) > delivery.triangles:
+            why = "its parts and holes need them; --cluster-gap 0 and --hole-edges leave fewer of these"
+            why = why if delivery.error is None else "fewer would move it farther than --error"
+            emit(Warned(f"--triangles {delivery.triangles}: {len(mesh.faces):,} are left, as {why}"))
+    return mesh, done
+
+
+def upright(mesh: Mesh, subject: MeshInput) -> np.ndarray:
+    """(3,) the direction that is up: of a map, or as the cameras are held; where these do not tell, as of pictures."""
+    if up_of_views(subject.views, subject.frame) is None:
+        return up_of(mesh, [view.camera for view in subject.views])
+    return up_direction(None, subject.views, subject.frame, np.eye(4)).direction
+
+
+def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Mesh]]:
+    """The meshes to be written, by name: all of it, and with shares of its triangles.
+
+    Raises:
+        BadInput: It is to be closed, and one of them would not be.
+    """
+    meshes = [("mesh", mesh)]
+    for at, share in enumerate(delivery.lods, 1):
+        less = simplified(mesh, max(1, round(share * len(mesh.faces))))
+        meshes.append((f"mesh-lod{at}", apart(less) if delivery.watertight else less))
+        emit(Progress("simplifying", at, len(delivery.lods)))
+    for name, each in meshes if delivery.watertight else ():
+        require_closed(each, name)
+        if "glb" in delivery.formats:  # which rounds places to 32 bits
+            rounded = replace(each, vertices=frame.to_file(each.vertices).astype(np.float32))
+            require_closed(rounded, f"{name}.glb")
+    return meshes
 
 
 def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
@@ -247,12 +334,10 @@ def forget_geometry(run: Run) -> None:
         emit(Warned("precision, recall and F1 were of the mesh before: `surfkit evaluate` with --gt measures this one"))
 
 
-def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> Iterator[Path]:
-    """Write the mesh in all formats and levels, and give the paths."""
-    meshes = [("mesh", mesh)]
-    for at, share in enumerate(delivery.lods, 1):
-        meshes.append((f"mesh-lod{at}", simplify_to(mesh, max(1, round(share * len(mesh.faces))))))
-        emit(Progress("simplifying", at, len(delivery.lods)))
+def write_files(
+    run: Run, meshes: Sequence[tuple[str, Mesh]], delivery: MeshOutput, subject: MeshInput
+) -> Iterator[Path]:
+    """Write meshes, by name, in all formats, and give the paths."""
     for name, each in meshes:
         kinds = list(dict.fromkeys(delivery.formats))
         for kind in kinds:
@@ -268,14 +353,24 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
                 yield path
 
 
-def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
-    """Write pictures of the mesh: from above, and beside the renders of a few training views."""
+def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> dict[str, str]:
+    """Write pictures of the mesh: from above, also coloured by each of its values, and beside the renders of a few
+    training views. What the colours mean, by the name of the picture.
+    """
     count = min(SHOWN, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
-    path = run.mesh_pictures / "above.png"
-    write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
+    path, up = run.mesh_pictures / "above.png", up_of(mesh, cameras)
+    write_picture(path, from_above(mesh, up, LONGEST))
     emit(FileWritten(path, "picture"))
+    told = {}
+    for name, values in mesh.values.items():
+        path, ends = run.mesh_pictures / f"above-{name}.png", ends_of(name, values)
+        write_picture(path, from_above(mesh, up, LONGEST, by_value(name, values, ends)))
+        if name in LENGTHS:
+            ends = ends[0] / subject.frame.scale, ends[1] / subject.frame.scale
+        told[path.name] = words_of(name, ends, unit_of(subject.frame))
+        emit(FileWritten(path, f"picture, {told[path.name]}"))
     for at, view in enumerate(views):
         camera = view.camera.fitted(LONGEST)
         color = subject.draw(view).color.clamp(0, 1)
@@ -285,6 +380,7 @@ def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
         path = run.mesh_pictures / f"view-{at + 1}.png"
         write_picture(path, torch.cat([color, shaded(mesh, camera)], dim=2))
         emit(FileWritten(path, "picture"))
+    return told
 
 
 def has_mesh(run: Run, steps: int, own: bool = False) -> bool:

@@ -23,7 +23,7 @@ from surfkit.core.files import replacing
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import hookimpl, name_of, plugins
 from surfkit.cuda.memory import peak_gpu_bytes
-from surfkit.mesh.base import Mesh
+from surfkit.mesh.base import VALUES, Mesh, require_values
 from surfkit.method.base import MethodInput, Reconstruction
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
@@ -175,7 +175,8 @@ def reopened(run: Run, given: MethodInput) -> Reconstruction:
     try:
         if kept.mesh is not None:
             with np.load(folder / "mesh.npz") as arrays:
-                mesh = Mesh(arrays["vertices"], arrays["faces"], arrays.get("colors"), kept.mesh)
+                values = {name: arrays[name] for name in VALUES if name in arrays}
+                mesh = Mesh(arrays["vertices"], arrays["faces"], arrays.get("colors"), kept.mesh, values)
         if kept.primitive is not None:
             params = safetensors.load_file(folder / "splats.safetensors")
             splats = SplatModel(kept.primitive, params, kept.sh_degree, kept.near)
@@ -217,9 +218,9 @@ def keep(run: Run, made: Reconstruction) -> None:
     folder.mkdir(exist_ok=True)
     if made.mesh is not None:
         refuse_unsound(made.mesh, name)
-        colors = {} if made.mesh.colors is None else {"colors": made.mesh.colors}
+        more = {} if made.mesh.colors is None else {"colors": made.mesh.colors}
         with replacing(folder / "mesh.npz") as file:
-            np.savez(file, vertices=made.mesh.vertices, faces=made.mesh.faces, **colors)
+            np.savez(file, vertices=made.mesh.vertices, faces=made.mesh.faces, **more, **made.mesh.values)
     if made.splats is not None:
         params = {key: value.detach().cpu().contiguous() for key, value in made.splats.params.items()}
         with replacing(folder / "splats.safetensors") as file:
@@ -264,6 +265,10 @@ def refuse_unsound(mesh: Mesh, name: str) -> None:
         raise BadInput(f"{said} of {len(vertices)} vertices with a face that names vertex {faces.max()}")
     if (colors := mesh.colors) is not None and (colors.shape != vertices.shape or colors.dtype != np.uint8):
         raise BadInput(f"{said} with colors {colors.shape} {colors.dtype}; they must be (V, 3) uint8")
+    try:
+        require_values(mesh)
+    except BadInput as error:
+        raise BadInput(f"method:{name}: {error}") from error
 
 
 def with_drawing(made: Reconstruction, rasterizer: Rasterizer) -> Reconstruction:

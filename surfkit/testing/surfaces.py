@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
-from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_values
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.trust import Trust
 from surfkit.testing.compare import assert_same, unchanged
@@ -98,6 +99,10 @@ def _check_whole(name: str, mesh: Mesh) -> None:
     there = faces.min() >= 0 and faces.max() < len(vertices)
     assert there, f"{name}: a face names a vertex that is not there"
     assert colors is None or len(colors) == len(vertices), f"{name}: colors are not one for each vertex"
+    try:
+        require_values(mesh)
+    except BadInput as error:
+        raise AssertionError(f"{name}: {error}") from error
     try:
         json.dumps(dump(dict(mesh.facts)), allow_nan=False)
     except (TypeError, ValueError) as error:

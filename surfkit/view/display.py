@@ -158,7 +158,8 @@ def _clustered(mesh: Mesh, low: np.ndarray, side: float) -> Mesh:
     faces = faces[(a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     colors = None if mesh.colors is None else np.round(mean(mesh.colors)).astype(np.uint8)
-    return Mesh(mean(mesh.vertices).astype(np.float32), faces[np.sort(first)], colors)
+    values = {name: mean(each[:, None])[:, 0].astype(np.float32) for name, each in mesh.values.items()}
+    return Mesh(mean(mesh.vertices).astype(np.float32), faces[np.sort(first)], colors, values=values)
 
 
 def some(count: int, budget: int) -> np.ndarray:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     import viser
 
 KIND = "triangles"
+OWN = "colours"
+"""In the choice of colours, beside the values of the vertices."""
 SENT = 64_000_000
 """Bytes of pictures and triangles up to which a browser is sent them without being asked."""
 
@@ -41,17 +43,24 @@ class MeshLayer:
         self.shown = gui.add_checkbox("mesh", shelf.subject.splats is None)
         self.budget = add_budget(gui, "most triangles", self.count, shelf.most)
         self.pictures = gui.add_checkbox("mesh with pictures", sent)
-        self.plain = gui.add_checkbox("mesh in grey", bare, disabled=bare)
+        self.plain = gui.add_checkbox("mesh in grey", bare and not mesh.values, disabled=bare and not mesh.values)
+        given = () if mesh.colors is None else (OWN,)
+        self.by = gui.add_dropdown("colours of the mesh", (*given, *mesh.values)) if mesh.values else None
         self.note = gui.add_markdown("")
         self.draw()
-        for switch in (self.shown, self.pictures, self.plain):
+        for switch in (self.shown, self.pictures, self.plain, *([self.by] if self.by is not None else [])):
             switch.on_update(telling(client, lambda _: self.draw()))
         self.budget.on_update(telling(client, Latest(self.draw)))
 
     @property
     def whole(self) -> bool:
         """Whether the mesh is drawn as it is in its file, with pictures."""
-        return self.textured is not None and self.pictures.value and not self.plain.value
+        return self.textured is not None and self.pictures.value and not self.plain.value and self.value is None
+
+    @property
+    def value(self) -> str | None:
+        """Which value of the vertices colours the mesh; None for its own colours."""
+        return None if self.by is None or self.plain.value or self.by.value == OWN else self.by.value
 
     def wanted(self) -> int:
         """Triangles that are to be drawn now, at most."""
@@ -61,15 +70,19 @@ class MeshLayer:
         """Send what the switches say."""
         with self.drawing:
             switches = ((self.budget, not self.whole), (self.pictures, self.textured is not None))
-            for part, sensible in (*switches, (self.plain, True), (self.note, True)):
+            more = [(self.by, not self.plain.value)] if self.by is not None else []
+            for part, sensible in (*switches, (self.plain, True), (self.note, True), *more):
                 part.visible = self.shown.value and sensible
             self.asked = self.wanted()
             if not self.shown.value:
                 self.client.scene.remove_by_name("/mesh")
             elif self.textured is not None and self.whole:
                 self.note.content = self._add_textured(self.textured)
-            else:
+            elif self.value is None:
                 self.note.content = self._add_mesh(self.shelf.mesh(self.asked))
+            else:
+                mesh, words = self.shelf.mesh_by(self.value, self.asked)
+                self.note.content = f"{words}. {self._add_mesh(mesh)}"
 
     def follow(self) -> None:
         """Draw as many triangles as the browser can draw in time while the camera moves, or rests."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import threading
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
@@ -12,8 +13,10 @@ import numpy as np
 import torch
 
 from surfkit.export.table import SplatTable
-from surfkit.mesh.base import Mesh
+from surfkit.mesh.base import LENGTHS, Mesh
+from surfkit.mesh.values import by_value, ends_of, words_of
 from surfkit.raster.api import Maps
+from surfkit.scene.lengths import unit_of as length_unit
 from surfkit.scene.scene import View
 from surfkit.scene.up_direction import map_axes
 from surfkit.view.by_view import Chosen, Eye, Levels, Lot, PointLot
@@ -67,6 +70,7 @@ class Shelf:
         self._places: Places | None = None
         self._splats = lru_cache(KEPT)(self._choose_splats)
         self._mesh = lru_cache(KEPT)(self._choose_mesh)
+        self._ends = lru_cache(KEPT)(self._ends_of)
 
     @property
     def size(self) -> int:
@@ -93,6 +97,18 @@ class Shelf:
         """The mesh with at most `budget` triangles."""
         with self.making:
             return self._mesh(budget)
+
+    def mesh_by(self, value: str, budget: int) -> tuple[Mesh, str]:
+        """The mesh with at most `budget` triangles, coloured by one of its values, and a line that says the scale."""
+        frame, mesh = self.subject.frame, self.mesh(budget)
+        ends = self._ends(value)
+        shown = (ends[0] / frame.scale, ends[1] / frame.scale) if value in LENGTHS else ends
+        painted = replace(mesh, colors=by_value(value, mesh.values[value], ends))
+        return painted, words_of(value, shown, length_unit(frame))
+
+    def _ends_of(self, value: str) -> tuple[float, float]:
+        assert self.subject.mesh is not None
+        return ends_of(value, self.subject.mesh.values[value])
 
     @property
     def triangles(self) -> Triangles:

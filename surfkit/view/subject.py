@@ -22,7 +22,7 @@ from surfkit.export.gltf_reader import UPS
 from surfkit.export.models import refuse_unsound
 from surfkit.export.table import SplatTable
 from surfkit.lod.tree import LodTree
-from surfkit.mesh.base import Mesh
+from surfkit.mesh.base import LENGTHS, VALUES, Mesh
 from surfkit.method.base import Reconstruction
 from surfkit.partition.plan import Plan
 from surfkit.pipeline import loaded
@@ -264,7 +264,13 @@ def local_mesh(surface: Surface, frame: Frame, colors: np.ndarray | None = None)
     vertices = frame.to_local(surface.vertices()).astype(np.float32)
     if colors is None:
         colors = colors_of(surface)
-    return Mesh(vertices, np.ascontiguousarray(surface.faces, np.int32), colors)
+    return Mesh(vertices, np.ascontiguousarray(surface.faces, np.int32), colors, values=values_of(surface, frame))
+
+
+def values_of(surface: Surface, frame: Frame) -> dict[str, np.ndarray]:
+    """(V,) float32 values of the vertices of a PLY file by name, see `VALUES`; lengths in local units."""
+    there = [name for name in VALUES if name in (surface.rows.dtype.names or ())]
+    return {name: (surface.rows[name] * (frame.scale if name in LENGTHS else 1.0)).astype(np.float32) for name in there}
 
 
 def colors_of(surface: Surface) -> np.ndarray | None:

@@ -1,6 +1,7 @@
 """`surfkit mesh`, and the mesh at the end of `surfkit train`."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
+from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.mesh.tsdf import TSDF
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")
@@ -58,7 +61,6 @@ def test_the_same_command_again_makes_nothing_and_another_mesher_only_the_mesh(f
 
 def test_another_mesh_of_the_same_run(finished, tmp_path, capsys, quick_comparison):
     out, _ = finished
-    needs("fast_simplification", "--lods")
     words = ["mesh:tsdf", "--mesh.voxel", "0.5", "--mesh.least-views", "0.5", "--metres-per-unit", "1"]
     words += ["--formats", "ply", "obj", "glb", "--lods", "0.5", "--least-triangles", "20", "--crop-box"]
     assert main(["mesh", str(out), *words, "-50", "-50", "-2", "50", "50", "3"]) == 0
@@ -88,6 +90,69 @@ def test_another_mesh_of_the_same_run(finished, tmp_path, capsys, quick_comparis
     assert not list(out.glob("mesh-lod*")) and not (out / "mesh.obj").exists(), "what was there before is gone"
 
 
+def test_fewer_triangles(finished, capsys):
+    out, _ = finished
+    words = ["mesh:tsdf", "--clusters", "1", "--cluster-gap", "0"]
+    assert main(["mesh", str(out), *words, "--triangles", "2000", "--lods", "0.5"]) == 0
+    facts = record(out)
+    whole, less = (trimesh.load(out / f"{name}.ply", process=False) for name in ("mesh", "mesh-lod1"))
+    assert len(whole.faces) == facts["triangles"] <= 2000 and len(less.faces) <= 1000
+    assert facts["simplification"]["triangles_before"] == facts["cleaning"]["triangles"] > 2 * 2000
+    shown = capsys.readouterr().out
+    assert f"{len(whole.faces):,}" in shown and f"{facts['cleaning']['triangles']:,} triangles" in shown
+    assert main(["mesh", str(out), *words, "--error", "0.02", "--triangles", "8", "--metres-per-unit", "1"]) == 0
+    assert 2000 < record(out)["triangles"] < facts["cleaning"]["triangles"]
+    assert "are left, as fewer would move it farther than --error" in capsys.readouterr().err
+    assert main(["mesh", str(out), "mesh:tsdf", "--triangles", "8"]) == 0
+    assert "are left, as its parts and holes need them; --cluster-gap 0" in capsys.readouterr().err
+
+
+def test_a_closed_mesh(finished, capsys):
+    """By trimesh, as it reads the files: in all formats and levels."""
+    out, _ = finished
+    words = ["--watertight", "--lods", "0.3", "--formats", "ply", "glb", "obj", "--error", "0.02"]
+    assert main(["mesh", str(out), "mesh:tsdf", *words, "--metres-per-unit", "1"]) == 0
+    for name in ("mesh", "mesh-lod1"):
+        for kind in ("ply", "glb", "obj"):
+            found = trimesh.load(out / f"{name}.{kind}", force="mesh")
+            assert found.is_watertight and found.is_winding_consistent and found.volume > 0, (name, kind)
+    closing = record(out)["closing"]
+    low = trimesh.load(out / "mesh.ply").vertices[:, 2].min()
+    assert closing["skirts"] >= 1 and closing["base"] == pytest.approx(low, abs=0.5)
+    assert closing["volume"] == pytest.approx(trimesh.load(out / "mesh.ply").volume, rel=0.05)
+    assert "parts on a base, " in capsys.readouterr().out
+
+
+def test_what_is_known_of_each_vertex_is_written_and_drawn(finished, monkeypatch, capsys):
+    """Of a mesher that counts views: colours of the picture, its words in the record and in the report."""
+    out, _ = finished
+    plain = TSDF.mesh
+
+    def counted(self, subject):
+        mesh = plain(self, subject)
+        views = np.where(mesh.vertices[:, 0] > np.median(mesh.vertices[:, 0]), 12, 1).astype(np.float32)
+        return replace(mesh, values={"views": views, "error": np.full(len(views), 0.5, np.float32)})
+
+    monkeypatch.setattr(TSDF, "mesh", counted)
+    assert main(["mesh", str(out), "mesh:tsdf", "--triangles", "3000"]) == 0
+    facts = record(out)
+    rows = read_surface(out / "mesh.ply").rows
+    assert {1, 12} <= set(np.round(rows["views"])) and np.isfinite(rows["error"]).all()
+    words = "views: red 1 or none, blue 10 or more photographs that confirm the surface"
+    assert facts["pictures"]["above-views.png"] == words
+    assert facts["pictures"]["above-error.png"].startswith("error: blue")
+    with Image.open(out / "mesh_pictures" / "above-views.png") as picture:
+        pixels = np.asarray(picture).reshape(-1, 3).astype(int)
+    assert (pixels[:, 0] > pixels[:, 2] + 60).sum() > 100 < (pixels[:, 2] > pixels[:, 0] + 60).sum()
+    assert main(["report", str(out)]) == 0 and words in (out / "report.html").read_text()
+    wrong = {"sight": np.zeros(3)}
+    monkeypatch.setattr(TSDF, "mesh", lambda self, subject: replace(plain(self, subject), values=wrong))
+    capsys.readouterr()
+    assert main(["mesh", str(out), "mesh:tsdf"]) == 2
+    assert "mesh:tsdf: values has the name 'sight'; vertices may have views, error" in capsys.readouterr().err
+    assert record(out) == facts
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -95,6 +160,8 @@ def test_another_mesh_of_the_same_run(finished, tmp_path, capsys, quick_comparis
         (["mesh:tsdf", "--mesh.voxel", "1"], "--metres-per-unit (1 if its coordinates are metres)"),
         (["--metres-per-unit", "-1"], "--metres-per-unit -1"),
         (["--lods", "2"], "--lods 2: a share of the triangles lies between 0 and 1"),
+        (["--triangles", "3"], "--triangles 3: give 4 or more"),
+        (["--error", "0"], "--error 0: it must be more than 0"),
         (["--least-triangles", "0"], "--least-triangles 0: give 1 or more"),
         (["--memory", "much"], "--memory much: give a size"),
         (["--memory", "1MB"], "too little to mesh in"),

@@ -155,6 +155,19 @@ def test_crops(tmp_path):
         read_crop(tmp_path / "none.json")
 
 
+def test_values_stay_with_their_vertices():
+    """Through welding, crop, clusters and holes: each vertex is numbered by its place."""
+    vertices, faces = ball()
+    doubled = vertices[faces].reshape(-1, 3)
+    number = (doubled @ np.float32([1, 10, 100])).astype(np.float32)
+    own = np.arange(len(doubled), dtype=np.int32).reshape(-1, 3)
+    mesh = Mesh(doubled, own[1:], values={"views": number, "error": -number})
+    kept, report = clean(mesh, 50, 1, lambda at: at[:, 2] < 0.8, hole_edges=4)
+    assert report.cropped and report.holes_closed == 1 and len(kept.values["views"]) == len(kept.vertices) < 162
+    assert kept.values["views"] == pytest.approx(kept.vertices @ np.float32([1, 10, 100]))
+    assert np.array_equal(kept.values["error"], -kept.values["views"])
+
+
 def test_an_empty_mesh_is_said():
     nothing = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
     with pytest.raises(BadInput, match="has no triangles"):

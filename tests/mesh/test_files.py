@@ -1,6 +1,7 @@
 """Files of meshes, read back by another library."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.mesh.base import Mesh
+from surfkit.mesh.base import Mesh, require_values
 from surfkit.mesh.files import write_mesh
 from surfkit.mesh.simplify import simplify_to
 from surfkit.scene.scene import Frame
+from surfkit.view.subject import local_mesh
 
 trimesh = needs("trimesh")
 SHIFT = (412_300.0, 5_712_300.0, 0.0)
@@ -132,3 +134,74 @@ def test_fewer_triangles_of_the_same_surface():
     assert np.abs(np.linalg.norm(small.vertices, axis=1) - 1).max() < 0.03
     assert np.abs(small.colors.astype(int) - (small.vertices + 1) * 127).max() < 25
     assert small.vertices.dtype == np.float32 and small.faces.dtype == np.int32
+
+
+def with_values():
+    mesh = ball()
+    views = np.arange(len(mesh.vertices), dtype=np.float32)
+    return replace(mesh, values={"views": views, "error": (views / 1000).astype(np.float32)})
+
+
+def test_values_are_properties_of_ply(tmp_path):
+    """Lengths in units of the input; colours and geometry as without them, in trimesh, in Open3D and in our reader."""
+    mesh, path = with_values(), tmp_path / "mesh.ply"
+    write_mesh(path, mesh, UTM)
+    read = trimesh.load(path, process=False, maintain_order=True)
+    rows = read.metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(np.ravel(rows["views"]), mesh.values["views"])
+    assert np.ravel(rows["error"]) == pytest.approx(mesh.values["error"] / 0.01, rel=1e-6)
+    assert np.abs(read.vertices + SHIFT - UTM.to_input(mesh.vertices)).max() < 1e-4
+    assert np.array_equal(read.faces, mesh.faces) and np.array_equal(colors_of(read), mesh.colors)
+    ours = read_surface(path)
+    assert np.array_equal(ours.rows["views"], mesh.values["views"]) and np.array_equal(ours.faces, mesh.faces)
+    back = local_mesh(ours, UTM)
+    assert back.values["error"] == pytest.approx(mesh.values["error"], rel=1e-6) and len(back.values) == 2
+    assert np.array_equal(back.values["views"], mesh.values["views"]) and back.values["error"].dtype == np.float32
+
+
+def test_values_are_attributes_of_glb(tmp_path):
+    """By the words of glTF 2.0: FLOAT SCALAR, an underscore before the name, offsets that are multiples of 4."""
+    mesh, path = with_values(), tmp_path / "mesh.glb"
+    write_mesh(path, mesh, UTM)
+    raw = path.read_bytes()
+    length = int.from_bytes(raw[12:16], "little")
+    root, data = json.loads(raw[20 : 20 + length]), raw[28 + length :]
+    attributes = root["meshes"][0]["primitives"][0]["attributes"]
+    assert set(attributes) == {"POSITION", "COLOR_0", "_VIEWS", "_ERROR"}
+    for name, wanted in (("_VIEWS", mesh.values["views"]), ("_ERROR", mesh.values["error"] / np.float32(0.01))):
+        accessor = root["accessors"][attributes[name]]
+        view = root["bufferViews"][accessor["bufferView"]]
+        assert (accessor["componentType"], accessor["type"], accessor["count"]) == (5126, "SCALAR", len(mesh.vertices))
+        assert view["byteOffset"] % 4 == 0 and view["byteStride"] == 4
+        found = np.frombuffer(data, "<f4", len(mesh.vertices), view["byteOffset"])
+        assert found == pytest.approx(wanted, rel=1e-6)
+    (read,) = trimesh.load(path, process=False).geometry.values()
+    assert np.array_equal(np.ravel(read.vertex_attributes["_VIEWS"]), mesh.values["views"])
+    assert np.array_equal(read.faces, mesh.faces) and "color" in read.visual.vertex_attributes
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_values_change_nothing_else(tmp_path, kind):
+    """Open3D sees the same mesh; OBJ has no place for them, and is the same file."""
+    open3d = needs("open3d")
+    found = []
+    for name, mesh in (("with", with_values()), ("without", ball())):
+        path = tmp_path / f"{name}.{kind}"
+        write_mesh(path, mesh, UTM)
+        found.append(open3d.io.read_triangle_mesh(str(path)))
+    assert (path.read_bytes() == (tmp_path / f"with.{kind}").read_bytes()) == (kind == "obj")
+    for part in ("vertices", "triangles", "vertex_colors"):
+        one, other = (np.asarray(getattr(each, part)) for each in found)
+        assert len(one) and np.array_equal(one, other), part
+
+
+def test_values_that_cannot_be_written_are_refused():
+    mesh, count = ball(), len(ball().vertices)
+    require_values(with_values())
+    for values, message in (
+        ({"sight": np.zeros(count, np.float32)}, "'sight'; vertices may have views, error"),
+        ({"views": np.zeros(count)}, rf"values.views is float64 of shape \[{count}\]; give float32"),
+        ({"error": np.zeros(3, np.float32)}, rf"float32 of shape \[3\]; give float32 of shape \[{count}\]"),
+    ):
+        with pytest.raises(BadInput, match=message):
+            require_values(replace(mesh, values=values))

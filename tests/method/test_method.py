@@ -74,7 +74,9 @@ class Lower(Method):
             emit(StepDone(index, self.steps, {"height": height}, 0))
             path.write_text(json.dumps([index, height]))
         vertices, faces = ground(given.scene, height)
-        return Reconstruction(mesh=Mesh(vertices, faces, facts={"levels": 2}), steps=self.steps, facts={"h": height})
+        values = {"views": np.full(len(vertices), 3, np.float32)}
+        mesh = Mesh(vertices, faces, facts={"levels": 2}, values=values)
+        return Reconstruction(mesh=mesh, steps=self.steps, facts={"h": height})
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def test_a_mesh_method_from_the_command_line(data, tmp_path, capsys):
     (out / "method" / "state.json").unlink()
     lines = (out / "events.jsonl").read_text().count("StepDone")
     assert main(words) == 0 and (out / "events.jsonl").read_text().count("StepDone") == lines, "its mesh is kept"
-    assert len(list((out / "mesh_pictures").glob("*.png"))) == 5
+    assert len(list((out / "mesh_pictures").glob("*.png"))) == 6
     capsys.readouterr()
     assert main([*words[:4], "6", *words[5:]]) == 2
     assert "holds a run with method.steps 5, and this one has 6" in capsys.readouterr().err
@@ -232,6 +234,7 @@ def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data,
     curve = ["curves", str(out), "--of", "loss", "--out", str(tmp_path / "curves.png")]
     assert main(curve) == 0 and (tmp_path / "curves.png").exists()
     assert main(["mesh", str(out), "--formats", "ply", "obj"]) == 0 and (out / "mesh.obj").exists()
+    assert b"property float views\n" in (out / "mesh.ply").read_bytes()[:500], "it is kept with the result"
     assert main(["evaluate", str(out), "--gt", str(out / "mesh.ply"), "--tau", "0.5"]) == 0
     assert json.loads((out / "metrics.json").read_text())["geometry"]["f1"] > 0.99
     capsys.readouterr()

@@ -11,11 +11,12 @@ from surfkit.core.codec import write_json
 from surfkit.core.events import Warned
 from surfkit.mesh import files
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.simplify import simplified
 from surfkit.readers.data import Data
 from surfkit.recipe import Recipe
 from surfkit.run import mesh as delivering
 from surfkit.run.folder import Run
-from surfkit.run.mesh import MeshOutput, forget_geometry, write_files
+from surfkit.run.mesh import MeshOutput, finished, forget_geometry, levels, write_files
 from surfkit.scene.scene import Frame
 
 TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
@@ -29,7 +30,7 @@ def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, wr
     told = []
     monkeypatch.setattr(delivering, "emit", told.append)
     run, subject = SimpleNamespace(out=tmp_path), SimpleNamespace(frame=Frame(np.zeros(3), 1.0))
-    found = list(write_files(run, TRIANGLE, MeshOutput(formats=tuple(formats)), subject))
+    found = list(write_files(run, [("mesh", TRIANGLE)], MeshOutput(formats=tuple(formats)), subject))
     assert [path.name for path in found] == written == [path.name for path in tmp_path.iterdir()]
     (warned,) = [event.text for event in told if isinstance(event, Warned)]
     assert "mesh.glb: 1 triangles" in warned and "at most 500" in warned
@@ -64,3 +65,33 @@ def test_what_was_measured_of_the_mesh_before_is_gone(tmp_path, monkeypatch, par
         assert found == ({"psnr": 20.0, "compressed": small}, small)
     forget_geometry(Run(out / part, Recipe(), Data(tmp_path)))
     assert len(told) == 1
+
+
+@pytest.mark.parametrize(("metres", "local"), [(None, 0.002), (2.0, 0.001)])
+def test_the_error_is_in_metres_or_else_in_units_of_the_data_set(metres, local):
+    """0.02 in a frame whose unit is a tenth of that of the data set."""
+    x, y = np.meshgrid(*2 * [np.linspace(0, 1, 40)], indexing="ij")
+    at = np.arange(1600).reshape(40, 40)
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    mesh = Mesh(np.stack([x, y, 0.1 * np.sin(5 * x)], 2).reshape(-1, 3).astype(np.float32), faces)
+    subject = SimpleNamespace(frame=Frame(np.zeros(3), 0.1, metres), views=())
+    found, done = finished(mesh, MeshOutput(error=0.02), subject)
+    assert np.array_equal(found.faces, simplified(mesh, error=local).faces) and len(found.faces) < len(faces) / 2
+    assert done == {"simplification": {"triangles_before": len(faces), "triangles": len(found.faces)}}
+    assert finished(mesh, MeshOutput(), subject) == (mesh, {})
+
+
+def test_a_level_that_would_not_be_closed_is_refused():
+    with pytest.raises(BadInput, match="mesh cannot be closed: 3 of its edges do not have two triangles"):
+        levels(TRIANGLE, MeshOutput(watertight=True), Frame(np.zeros(3), 1.0))
+
+
+def test_a_closed_mesh_whose_file_would_not_be_is_refused():
+    """So far from 0 that 32 bits hold whole units only: two corners of a tetrahedron become one."""
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0, 9, 0], [0, 0, 9]], np.float32)
+    solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32))
+    far = Frame(np.array([1e7, 0, 0]), 1.0)
+    assert levels(solid, MeshOutput(watertight=True), far) == [("mesh", solid)]
+    with pytest.raises(BadInput, match=r"mesh\.glb cannot be closed: \d of its edges"):
+        levels(solid, MeshOutput(watertight=True, formats=("glb",)), far)

@@ -137,6 +137,15 @@ def test_a_coarser_mesh_is_the_same_surface():
     assert len(fewer_faces(grid(120), 1).faces) <= 1
 
 
+def test_a_coarser_mesh_has_the_means_of_its_values():
+    x = np.linspace(0, 1, 33, dtype=np.float32)
+    places = np.stack([*np.meshgrid(x, x), np.zeros((33, 33))], 2).reshape(-1, 3).astype(np.float32)
+    at = np.arange(33 * 33).reshape(33, 33)
+    faces = np.stack([at[:-1, :-1], at[:-1, 1:], at[1:, :-1]], 2).reshape(-1, 3).astype(np.int32)
+    small = fewer_faces(Mesh(places, faces, values={"views": places[:, 0].copy()}), 200)
+    assert len(small.faces) <= 200 and small.values["views"] == pytest.approx(small.vertices[:, 0], abs=1e-6)
+
+
 def test_a_mesh_for_a_browser_is_read_by_trimesh():
     trimesh = needs("trimesh")
     mesh = grid(12, 0.3)

@@ -302,6 +302,32 @@ def test_a_mesh_is_shown_in_its_coordinates(tmp_path, name):
     assert np.allclose(subject.mesh.colors, 200, atol=1)
 
 
+@pytest.mark.parametrize("colored", [True, False])
+def test_a_mesh_is_coloured_by_what_is_known_of_it(tmp_path, colored):
+    needs("viser")
+    values = {"views": np.float32([0, 3, 30]), "error": np.float32([0.1, 0.2, 0.3])}
+    mesh = replace(TRIANGLE, values=values, colors=TRIANGLE.colors if colored else None)
+    write_mesh(tmp_path / "mesh.ply", mesh, SURVEY)
+    with opened_subject(tmp_path / "mesh.ply", "cpu") as subject, served(Address(), "test") as found:
+        show(subject, found, tmp_path / "out")
+        shelf = Shelf(subject)
+        low, middle, high = shelf.mesh_by("views", 9)[0].colors.astype(int)
+        assert low[0] > low[2] + 100 and high[2] > high[0] + 100 and abs(middle[0] - middle[2]) < 150
+        small, _, large = shelf.mesh_by("error", 9)[0].colors.astype(int)
+        assert large[0] > large[2] + 100 and small[2] > small[0] + 100
+        assert shelf.mesh_by("error", 9)[1] == "error: blue 1.04 m or less, red 2.96 m or more, grey not known"
+        browser = Browser(found.url)
+        browser.wait_for(Browser.is_whole)
+        said = "red 1 or none, blue 10 or more photographs"
+        if colored:
+            browser.wait_for(lambda b: any("all 1 triangles are shown" in t and said not in t for t in b.texts()))
+            browser.set("colours of the mesh", "views")
+        browser.wait_for(lambda b: any(said in t and "all 1 triangles" in t for t in b.texts()))
+        browser.set("mesh in grey", True)
+        browser.wait_for(lambda b: not any(said in t for t in b.texts()))
+        browser.close()
+
+
 def test_points_are_shown(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     colors = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))

@@ -12,6 +12,7 @@
 
 #include "../../native/pool.h"
 #include "agree.h"
+#include "collapse.h"
 #include "grid.h"
 #include "shade.h"
 
@@ -129,6 +130,18 @@ void add_mesh(nb::module_& m) {
         },
         nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
         nb::arg("least"), nb::arg("shade"), nb::arg("slant"), nb::arg("kernels"), nb::arg("threads"));
+    m.def("collapse", [](Floats vertices, Whole faces, int64_t least, double limit, Bytes fixed, bool flat) {
+        const CollapseJob job{vertices.data(), (int64_t)vertices.shape(0), faces.data(), (int64_t)faces.shape(0),
+                              fixed.data(),    least,                      flat,         limit};
+        Collapsed made;
+        {
+            nb::gil_scoped_release free;
+            made = collapse(job);
+        }
+        const size_t v = made.vertices.size() / 3, f = made.faces.size() / 3, all = made.into.size();
+        return nb::make_tuple(given(std::move(made.vertices), {v, 3}), given(std::move(made.faces), {f, 3}),
+                              given(std::move(made.into), {all}));
+    });
     m.def("draw_faces", [](Floats vertices, Whole faces, Made depth,
                            nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
         FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),

@@ -28,6 +28,8 @@ from surfkit.report.html.source import Source, heading
 from surfkit.report.html.values import flat, in_words, mapping, number, numeric, plain, value_at
 
 ERROR_COLORS = "Blue is within the distance threshold, orange to red is further away."
+BY_VALUE = {"above-views.png": "views", "above-error.png": "error"}
+"""Pictures of the mesh by values of its vertices, and what these are called."""
 VIEWS = ("view-1", "view-2", "view-3", "view-4")
 SCORES = ("precision", "recall", "f1")
 ERRORS = (("plan", "from above"), ("view0", "view 1"), ("view1", "view 2"), ("view2", "view 3"))
@@ -74,7 +76,12 @@ def _views(runs: Sequence[Source]) -> list[Element]:
 def _above(run: Source) -> list[Element]:
     path = run.out / "mesh_pictures" / "above.png"
     picture = Picture(path, f"mesh of {run.name} from above")
-    return [Figure(picture, "from above; blue is seen from behind")] if path.is_file() else []
+    found: list[Element] = [Figure(picture, "from above; blue is seen from behind")] if path.is_file() else []
+    for name, words in mapping(run.mesh, "pictures").items():
+        path = run.out / "mesh_pictures" / name
+        if name in BY_VALUE and isinstance(words, str) and path.is_file():
+            found.append(Figure(Picture(path, f"mesh of {run.name} from above, by its {BY_VALUE[name]}"), words))
+    return found
 
 
 def halves(path: Path, names: tuple[str, str], run: Source) -> tuple[Picture, Picture]:
@@ -92,7 +99,7 @@ def _mesh_table(run: Source) -> Table:
     mesher = mapping(run.mesh, "mesher")
     rows = [plain("mesher", mesher.get("use"))]
     for name in ("triangles", "vertices", "clusters_kept", "clusters", "boundaries", "holes_closed"):
-        if (value := number(cleaning, name)) is not None:
+        if (value := number(run.mesh, name) or number(cleaning, name)) is not None:
             rows.append(plain(name.replace("_", " "), f"{value:,.0f}"))
     if (share := number(cleaning, "boundary_share")) is not None:
         rows.append(plain("share of edges that are boundaries", f"{share:.1%}"))
