@@ -8,9 +8,17 @@ from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tetra import Tetra
 from surfkit.mesh.tsdf import TSDF
+from surfkit.mesh.visibility import Visibility
 
 
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Names of what this folder offers."""
-    return {"tsdf": TSDF, "tetra": Tetra, "poisson": Poisson, "stereo": Stereo, "agreement": Agreement}
+    return {
+        "tsdf": TSDF,
+        "tetra": Tetra,
+        "poisson": Poisson,
+        "stereo": Stereo,
+        "visibility": Visibility,
+        "agreement": Agreement,
+    }

@@ -120,16 +120,9 @@ def separated(mesh: Mesh) -> Mesh:
     from scipy.sparse.csgraph import connected_components
 
     count = mesh.faces.size
-    corners = np.arange(count).reshape(-1, 3)
-    start, end = mesh.faces.ravel().astype(np.int64), np.roll(mesh.faces, -1, 1).ravel().astype(np.int64)
-    after = np.roll(corners, -1, 1).ravel()
-    names = np.minimum(start, end) << 32 | np.maximum(start, end)
-    order = np.argsort(names, kind="stable")  # half-edges, each by the corner where it starts
-    first = np.flatnonzero(np.diff(names[order], prepend=-1))
-    sizes = np.diff(np.append(first, count))
-    pairs = order[first[sizes == 2][:, None] + [0, 1]].reshape(-1, 2)
+    start, end, pairs, crowded = _half_edges(mesh)
     pairs = pairs[start[pairs[:, 0]] == end[pairs[:, 1]]]
-    crowded = [order[at : at + size] for at, size in zip(first[sizes > 2], sizes[sizes > 2], strict=True)]
+    after = np.roll(np.arange(count).reshape(-1, 3), -1, 1).ravel()
     more = [pair for some in crowded for pair in _side_by_side(mesh, some, start, end)]
     pairs = np.concatenate([pairs, np.array(more, np.int64).reshape(-1, 2)])
     # A half-edge from a to b and one from b to a: the corners at a are of one fan, and so are those at b.
@@ -138,7 +131,58 @@ def separated(mesh: Mesh) -> Mesh:
     links = coo_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
     fans = connected_components(links, directed=False)[1]
     _, row, at = np.unique(start << 32 | fans, return_index=True, return_inverse=True)  # in the order of the vertices
-    return mesh.take(mesh.faces.ravel()[row], at.reshape(-1, 3).astype(np.int32))
+    mesh = mesh.take(mesh.faces.ravel()[row], at.reshape(-1, 3).astype(np.int32))
+    for _ in range(ROUNDS):
+        if not (halves := _half_edges(mesh))[3]:
+            break
+        mesh = _halved(mesh, halves)
+    return mesh
+
+
+Halves = tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]
+
+
+def _half_edges(mesh: Mesh) -> Halves:
+    """(H,) vertices where each half-edge starts and ends; (P, 2) those that two make an edge; and those of edges with
+    more. Half-edge 3 f + k goes from corner k of triangle f to the next."""
+    start, end = mesh.faces.ravel().astype(np.int64), np.roll(mesh.faces, -1, 1).ravel().astype(np.int64)
+    names = np.minimum(start, end) << 32 | np.maximum(start, end)
+    order = np.argsort(names, kind="stable")
+    first = np.flatnonzero(np.diff(names[order], prepend=-1))
+    sizes = np.diff(np.append(first, len(names)))
+    pairs = order[first[sizes == 2][:, None] + [0, 1]].reshape(-1, 2)
+    crowded = [order[at : at + size] for at, size in zip(first[sizes > 2], sizes[sizes > 2], strict=True)]
+    return start, end, pairs, crowded
+
+
+def _halved(mesh: Mesh, halves: Halves) -> Mesh:
+    """The mesh with new vertices in the middle of crowded edges, of all but one of the surfaces that pass there.
+
+    Two surfaces may have both ends of an edge in common, as their triangles go around from one to the other; then
+    doubling vertices does not part them. Triangles with two such edges are left for the next time.
+    """
+    start, end, _, crowded = halves
+    faces, made, ends, touched = mesh.faces.copy(), [], [], set()
+    for some in crowded:
+        pairs = list(_side_by_side(mesh, some, start, end))
+        paired = {half for pair in pairs for half in pair}
+        sheets = pairs + [(half,) for half in some.tolist() if half not in paired]
+        for sheet in sheets[1:]:
+            triangles = {half // 3 for half in sheet}
+            if triangles & touched:
+                continue
+            touched |= triangles
+            middle = len(mesh.vertices) + len(ends)
+            ends.append((start[sheet[0]], end[sheet[0]]))
+            for half in sheet:
+                face, k = divmod(half, 3)
+                made.append((middle, *(faces[face, (k + turn) % 3] for turn in (1, 2))))
+                faces[face, (k + 1) % 3] = middle
+    low, high = np.array(ends, np.int64).reshape(-1, 2).T
+    rows = np.concatenate([np.arange(len(mesh.vertices)), low])
+    found = mesh.take(rows, np.concatenate([faces, np.array(made, np.int32).reshape(-1, 3)]))
+    found.vertices[len(mesh.vertices) :] = (mesh.vertices[low] + mesh.vertices[high]) / 2
+    return found
 
 
 def _side_by_side(mesh: Mesh, some: np.ndarray, start: np.ndarray, end: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from surfkit.core.events import Progress, emit
+from surfkit.native import module
 
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Vertices of the edges of a tetrahedron."""
@@ -115,3 +118,28 @@ def circumscribed(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         offset = offset / (2 * volume[:, None])
     offset = np.where(np.isfinite(offset), offset, np.inf)
     return corners[:, 0] + offset, np.linalg.norm(offset, axis=1)
+
+
+@dataclass(frozen=True)
+class Tetrahedra:
+    """A Delaunay tetrahedralisation.
+
+    Attributes:
+        points: (P + 4, 3) float64: those given, and the corners of a tetrahedron around all.
+        corners: (T, 4) int32 rows of points, positively oriented.
+        neighbours: (T, 4) int32 the tetrahedron opposite to each corner; -1 for none.
+    """
+
+    points: np.ndarray
+    corners: np.ndarray
+    neighbours: np.ndarray
+
+
+def tetrahedralised(points: np.ndarray) -> Tetrahedra:
+    """The Delaunay tetrahedralisation of (P, 3) float64 points, by the compiled part: 6 us and 250 bytes a point.
+
+    Points are rounded to a millionth of their extent, and are exact from there on; one in the place of another is left
+    out, as the corner of no tetrahedron. Four points enclose all, so the hull is not exactly convex.
+    """
+    corners, neighbours, enclosing, _ = module().tetrahedralise(np.ascontiguousarray(points, np.float64))
+    return Tetrahedra(np.concatenate([points, enclosing]), corners, neighbours)

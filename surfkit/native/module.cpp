@@ -9,6 +9,7 @@ namespace surfkit {
 
 void add_raster(nanobind::module_& m);
 void add_mesh(nanobind::module_& m);
+void add_visibility(nanobind::module_& m);
 void add_stereo(nanobind::module_& m);
 void add_compress(nanobind::module_& m);
 void add_texture(nanobind::module_& m);
@@ -32,6 +33,7 @@ NB_MODULE(_native, m) {
     surfkit::keep_freed_memory();
     surfkit::add_raster(m);
     surfkit::add_mesh(m);
+    surfkit::add_visibility(m);
     surfkit::add_stereo(m);
     surfkit::add_compress(m);
     surfkit::add_texture(m);

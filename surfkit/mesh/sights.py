@@ -1,0 +1,169 @@
+"""What the views see of a surface, on disk: depth of splats and of stereo, their weights, normals and colours."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.mesh.base import MeshInput
+from surfkit.mesh.fusion import TILES
+from surfkit.mesh.overlap import Depths
+from surfkit.mesh.picture import Which, depth_of
+from surfkit.mesh.trust import Trust
+from surfkit.scene.camera import Camera
+
+PIXEL_BYTES = 18
+"""Bytes per pixel of a view on disk."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a view sees.
+
+    Attributes:
+        camera: Of the view.
+        depth: (L, H, W) float32 camera z of each of its depth maps, local units; 0 for none.
+        weight: (L, H, W) float32 how far each depth is trusted; 0 does not count.
+        normal: (3, H, W) float32 of the surface, camera axes, of any length.
+        color: (3, H, W) uint8.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    weight: np.ndarray
+    normal: np.ndarray
+    color: np.ndarray
+
+    @property
+    def native(self) -> tuple[Any, ...]:
+        """As the compiled part takes it."""
+        camera = self.camera
+        lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+        return self.depth, self.weight, self.normal, self.color, lens, camera.world_to_camera.flatten().tolist()
+
+
+class Sights(Sequence[Sight]):
+    """The sights of all views, in a folder."""
+
+    def __init__(self, folder: Path, cameras: Sequence[Camera]) -> None:
+        self.folder, self.cameras = folder, tuple(cameras)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, at: int) -> Sight:  # type: ignore[override]
+        depth, weight, normal, color = (np.load(self.folder / f"{at}-{name}.npy") for name in NAMES)
+        return Sight(self.cameras[at], depth, weight.astype(np.float32), normal.astype(np.float32), color)
+
+    def depths(self) -> Depths:
+        """The first depth map of each view."""
+
+        def read(at: int) -> torch.Tensor:
+            return torch.from_numpy(np.load(self.folder / f"{at}-depth.npy", mmap_mode="r")[0].copy())
+
+        return Depths(self.cameras, read)
+
+    def write(self, at: int, **arrays: np.ndarray) -> None:
+        """Write some of the arrays of a view, by their names in `Sight`."""
+        for name, values in arrays.items():
+            np.save(self.folder / f"{at}-{name}.npy", values)
+
+
+NAMES = "depth", "weight", "normal", "color"
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How views look at splats.
+
+    Attributes:
+        which: Depth of a pixel that is drawn.
+        limit: Depth from which nothing counts, local units.
+        trust: Of what is drawn.
+        doubted: Least weight of what is drawn where `trust` has some by the view alone, and none by others.
+        stereo: Weight of the depth of a prior at full confidence.
+        confident: Least confidence of a prior that counts.
+    """
+
+    which: Which
+    limit: float
+    trust: Trust
+    doubted: float
+    stereo: float
+    confident: float
+
+
+@contextmanager
+def seen(subject: MeshInput, how: Seeing) -> Iterator[Sights]:
+    """What all views see, each drawn once, and compared with the others.
+
+    Raises:
+        BadInput: The disk has no room for it.
+    """
+    views = subject.views
+    needed = PIXEL_BYTES * sum(view.camera.width * view.camera.height for view in views)
+    with tempfile.TemporaryDirectory(dir=subject.scratch, prefix=TILES.rstrip("*")) as name:
+        folder = Path(name)
+        if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
+            raise BadInput(
+                f"{folder.parent}: {needed / 1e9:.1f} GB of disk are needed for the depth of all views and "
+                f"{free / 1e9:.1f} GB are free; make room"
+            )
+        sights = Sights(folder, [view.camera for view in views])
+        for at in range(len(views)):
+            sights.write(at, **_drawn(subject, at, how))
+            emit(Progress("drawing views", at + 1, len(views)))
+        depths = sights.depths()
+        for at in range(len(views)):
+            weight = np.load(folder / f"{at}-weight.npy")
+            among = how.trust.among(at, depths).numpy()
+            weight[0] = np.where(weight[0] > 0, np.maximum(among, how.doubted), 0)
+            sights.write(at, weight=weight)
+            emit(Progress("comparing views", at + 1, len(views)))
+        yield sights
+
+
+def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
+    view = subject.views[at]
+    maps, keep = subject.draw(view), subject.keep(at)
+    depth = depth_of(maps, how.which)
+    depth = torch.where(depth <= how.limit, depth, 0.0)
+    if keep is not None:
+        depth = torch.where(keep, depth, 0.0)
+    own = how.trust.within(maps, depth, None)
+    layers, weights = [torch.where(own > 0, depth, 0.0)], [own]
+    prior = None if subject.priors is None else subject.priors[at]
+    if prior is not None:
+        known = (prior.inverse > 1 / how.limit) & (prior.confidence >= how.confident)
+        if keep is not None:
+            known &= keep
+        layers.append(torch.where(known, 1 / prior.inverse.clamp_min(1e-20), 0.0))
+        weights.append(torch.where(known, how.stereo * prior.confidence, 0.0))
+    normal = torch.zeros(3, *depth.shape) if maps.normal is None else maps.normal
+    length = normal.norm(dim=0).clamp_min(1e-6)
+    return {
+        "depth": torch.stack(layers).float().numpy(),
+        "weight": torch.stack(weights).half().numpy(),
+        "normal": (127 * normal / length).round().to(torch.int8).numpy(),
+        "color": (255 * maps.color.clamp(0, 1)).round().to(torch.uint8).numpy(),
+    }
+
+
+Each = Callable[[Sight], None]
+
+
+def for_all(sights: Sights, what: str, each: Each) -> None:
+    """Call `each` with every sight, and report progress."""
+    for at in range(len(sights)):
+        each(sights[at])
+        emit(Progress(what, at + 1, len(sights)))

@@ -1,0 +1,478 @@
+"""A closed surface between what views see through and what they do not: votes, and the cut that costs least.
+
+Labatut, Pons and Keriven (2009): points are tetrahedralised, what the cameras see votes which tetrahedra are empty and
+which are full, and the surface is the minimum cut between both. Jancosek and Pajdla (2011): where few votes are, as on
+walls in the shade, they still decide. Votes are the depth maps' own, asked for at places in space, and not rays of
+single points: a depth map also knows what it sees between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import choice
+from surfkit.mesh.adjust import adjusted, beside
+from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.closed import apart, separated
+from surfkit.mesh.delaunay import Tetrahedra, tetrahedralised
+from surfkit.mesh.lengths import look, with_unit
+from surfkit.mesh.oversampling import oversampled
+from surfkit.mesh.oversized import without_oversized
+from surfkit.mesh.picture import Which
+from surfkit.mesh.sights import Seeing, Sights, for_all, seen
+from surfkit.mesh.sky import may_show_sky, without_sky
+from surfkit.mesh.trust import Trust
+from surfkit.native import module
+from surfkit.scene.lengths import Length, check_length, to_local
+from surfkit.scene.scene import Frame, View
+from surfkit.scene.up_direction import up_of_views
+
+OUTWARD = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+"""Corners of the face opposite to each corner of a positively oriented tetrahedron, counter-clockwise from outside."""
+SHELL = (-0.5, 0.5, 1.0, 1.5, 2.0)
+"""Places before and behind a point along its normal that are looked at, cells: tetrahedra behind a surface are large,
+and would be met by chance."""
+SHELL_DEPTH = 0.5
+"""Cells that each of these places stands for."""
+MOST_PLACES = 16
+"""Places within one tetrahedron that are looked at."""
+CONFIDENT = 0.25
+"""Confidence of a prior from which its depth counts."""
+POINT_BYTES = 2_000
+"""Memory that a point takes, with its tetrahedra and the places in these."""
+LEAST_POINTS = 4
+CAMERA = 1e3
+"""Volume that a camera stands for in the tetrahedron that holds it, cells."""
+RELIABLE = 0.3
+"""Sum of the weights of the depths at the middle of a face from which they confirm it."""
+
+
+LIMITS = (
+    ("cell_px", 0.1, 100),
+    ("oversampling", 0.1, 8),
+    ("largest_px", 0, 1e6),
+    ("doubted", 0, 1),
+    ("stereo", 0, 100),
+    ("least_weight", 0, 1000),
+    ("flat", 0, 1),
+    ("noise_px", 0.01, 100),
+    ("noise", 0, 0.1),
+    ("thickness", 1, 100),
+    ("area", 0.001, 1000),
+    ("aligned", 0, 1),
+    ("certain", 0.001, 1000),
+    ("sure", 0.001, 1),
+    ("hidden", 0, 10),
+    ("damping", 0.001, 1000),
+    ("guesses", 0, 1e6),
+    ("smooth", 0.001, 1000),
+    ("longest", 2, 1000),
+)
+"""Of the numbers of `Visibility`: the least and the most."""
+
+
+@dataclass(frozen=True)
+class Visibility(Mesher):
+    """The surface that separates what views see through from what they do not, closed where something was seen."""
+
+    cell: Length = "auto"
+    """Side of the cells in which depth is averaged to points, metres; auto is `cell_px` pixels at the median depth."""
+
+    cell_px: float = 1.3
+    """Side of the cells in pixels at the median depth where it is auto."""
+
+    depth_limit: Length = "auto"
+    """Depth beyond which pixels do not count, metres; auto as in mesh:tsdf."""
+
+    depth: Which = "median"
+    """Depth of a pixel, as in mesh:tsdf."""
+
+    oversampling: float = 1.0
+    """Pixels of a depth map for each pixel in a row of the photograph, as in mesh:tsdf."""
+
+    largest_px: float = 64.0
+    """Leave out splats with a larger standard deviation, in pixels at the median depth, where splats are drawn; 0 keeps
+    all."""
+
+    sky: bool = False
+    """Let the sky count too, as in mesh:tsdf."""
+
+    trust: Annotated[Trust, choice(Trust)] = field(default_factory=partial(Agreement, alone=0.5, covered_by=2))
+    """How far the depth of a pixel that is drawn is trusted."""
+
+    doubted: float = 0.05
+    """Weight of depth that no other view confirms."""
+
+    stereo: float = 2.0
+    """Weight of stereo depth at full confidence, where there is some; drawn depth has 1. 0 leaves it out."""
+
+    least_weight: float = 0.5
+    """Sum of the weights of the pixels in a cell that has a point."""
+
+    flat: float = 0.25
+    """Points become one for eight cells, or 64, where they lie this near to a plane, in cells; 0 keeps all."""
+
+    noise_px: float = 0.75
+    """Standard deviation of a depth, in widths of a pixel there."""
+
+    noise: float = 0.0005
+    """What is added to it, as a share of the depth."""
+
+    thickness: float = 2.0
+    """Standard deviations behind a depth that it votes for as full: thin walls have two sides."""
+
+    area: float = 1.0
+    """What an area costs against the volumes that votes contradict: more gives a smoother surface."""
+
+    aligned: float = 0.3
+    """Share of that cost where a face lies as the normals of its points."""
+
+    certain: float = 1.0
+    """Sum of the votes at which half of the cost of a face is left: where many views look, they decide."""
+
+    sure: float = 0.1
+    """Share of the cost that is left in any case."""
+
+    hidden: float = 0.1
+    """Vote for full of what no view looks at."""
+
+    damping: float = 0.25
+    """Sum of votes at which they count half."""
+
+    guesses: float = 6.0
+    """How far the surface goes on where no view confirms it, in cells: what is left are gaps that are closed."""
+
+    smooth: float = 1.0
+    """Weight of the faces around a vertex, where 1 is that of a pixel that is fully trusted, when vertices are moved to
+    where the depth maps have them; more is smoother."""
+
+    longest: float = 12.0
+    """Longest edge of a triangle, cells: across the rim of what is seen lie larger ones."""
+
+    def __post_init__(self) -> None:
+        for name in ("cell", "depth_limit"):
+            check_length(f"mesh.{name}", getattr(self, name))
+        for name, low, high in LIMITS:
+            if not low <= getattr(self, name) <= high:
+                raise BadInput(f"mesh.{name} is {getattr(self, name):g}; it must be from {low:g} to {high:g}")
+
+    @property
+    def needs_prior(self) -> bool:
+        """See `Mesher.needs_prior`."""
+        return not self.sky or self.stereo > 0
+
+    def needs_prior_of(self, views: list[View], frame: Frame) -> bool:
+        """See `Mesher.needs_prior_of`."""
+        return self.stereo > 0 or (not self.sky and may_show_sky(views, up_of_views(views, frame)))
+
+    def refuse_unfit(self, frame: Frame) -> None:
+        """See `Mesher.refuse_unfit`."""
+        for name in ("cell", "depth_limit"):
+            to_local(getattr(self, name), frame, f"mesh.{name}: ")
+
+    def ready(self) -> None:
+        """See `Mesher.ready`."""
+        if module() is None:
+            raise BadInput(
+                "mesh:visibility needs the compiled part of surfkit, and no C++ compiler was found when it was "
+                "installed; install GCC or Clang, then surfkit again, or use mesh:tsdf"
+            )
+
+    def mesh(self, subject: MeshInput) -> Mesh:
+        """See `Mesher.mesh`."""
+        self.ready()
+        if not len(subject.splats) or not subject.views:
+            raise BadInput("nothing to mesh: there are no splats or no views")
+        if not self.sky:
+            subject = without_sky(subject)
+        if self.largest_px and subject.draw_of is not None:
+            subject = without_oversized(subject, self.largest_px, self.depth)
+        side, limit = self._lengths(subject)
+        subject = oversampled(subject, self.oversampling)
+        how = Seeing(self.depth, limit, self.trust, self.doubted, self.stereo, CONFIDENT)
+        with seen(subject, how) as sights:
+            points, side = self._points(sights, side, limit, subject)
+            mesh = self.surface(sights, points, side)
+        if not len(mesh.faces):
+            raise BadInput(
+                "no surface: no face between what is seen through and what is not is confirmed by a view; train for "
+                "more steps"
+            )
+        return replace(mesh, facts=facts(side, limit, subject.frame) | {"points": len(points.places)})
+
+    def _points(self, sights: Sights, side: float, limit: float, subject: MeshInput) -> tuple[Points, float]:
+        """The points of the surface, as many as the memory holds, and the side of their cells, local units."""
+        most, frame = subject.budget_bytes // POINT_BYTES, subject.frame
+        while True:
+            points = gather(sights, side, limit, self.least_weight, self.flat)
+            if len(points.places) < LEAST_POINTS:
+                raise BadInput(
+                    f"no surface: of cells of {with_unit(side, frame)}, {len(points.places)} have a depth with the "
+                    f"weight of --mesh.least-weight {self.least_weight:g}; lower it, or train for more steps"
+                )
+            if len(points.places) <= most:
+                return points, side
+            coarser = 1.05 * side * (len(points.places) / most) ** 0.5
+            told = f"{len(points.places):,} points in cells of {with_unit(side, frame)} need {POINT_BYTES} bytes each"
+            told += f", and {subject.budget_bytes / 1e9:.1f} GB may be used"
+            if self.cell != "auto":
+                raise BadInput(f"{told}; give --mesh.cell {with_unit(coarser, frame)} or more, or more --memory")
+            emit(Warned(f"{told}: cells are made larger, {with_unit(coarser, frame)}; more --memory keeps them"))
+            side = coarser
+
+    def _lengths(self, subject: MeshInput) -> tuple[float, float]:
+        """Side of a cell and the largest depth, local units."""
+        side, limit = (to_local(value, subject.frame) for value in (self.cell, self.depth_limit))
+        if side is None or limit is None:
+            depth, pixel, far = look(subject, self.depth)
+            side, limit = side or self.cell_px * pixel, limit or max(2 * depth, far)
+        return side, limit
+
+    def surface(self, sights: Sights, points: Points, side: float) -> Mesh:
+        """The surface of what views see, without facts.
+
+        Args:
+            sights: What they see.
+            points: On the surface.
+            side: Of a cell, local units.
+        """
+        tets = tetrahedralised(points.places)
+        faces = self.cut(sights, points, tets, side)
+        far = np.max(
+            [np.linalg.norm(tets.points[faces[:, i]] - tets.points[faces[:, i - 1]], axis=1) for i in range(3)], 0
+        )
+        faces = faces[far < self.longest * side]
+        faces = faces[supported(sights, tets.points, faces, side, self.guesses)]
+        used, at = np.unique(faces, return_inverse=True)
+        mesh = Mesh(tets.points[used].astype(np.float32), at.reshape(-1, 3).astype(np.int32), points.colors[used])
+        if not len(faces):
+            return mesh
+        near = side * min(min(camera.fx, camera.fy) for camera in sights.cameras)
+        return apart(adjusted(sights, separated(mesh), side, near, self.smooth))
+
+    def cut(self, sights: Sights, points: Points, tets: Tetrahedra, side: float) -> np.ndarray:
+        """(F, 3) int32 rows of points: the faces between empty and full tetrahedra, facing outwards."""
+        native, threads = module(), torch.get_num_threads()
+        count = len(tets.corners)
+        volumes = np.empty(count)
+        native.volumes(tets.points, tets.corners, volumes, threads)
+        owner, shell, starts, places, cells = self._places(points, tets, volumes, side)
+        empty, full = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
+
+        def vote(sight: Any) -> None:
+            noise = self.noise_px / min(sight.camera.fx, sight.camera.fy) + self.noise
+            native.vote(places, noise, self.thickness, empty, full, *sight.native, threads)
+
+        for_all(sights, "voting", vote)
+        votes = empty + full
+        enclosed = (tets.corners < len(points.places)).all(1)
+        hidden = np.where(enclosed, self.hidden, 0).astype(np.float32)
+        balance = (empty - full - hidden[owner]) / (votes + self.damping)
+        within = np.diff(starts, append=shell)
+        volume = np.bincount(owner[:shell], balance[:shell], count) / within * volumes
+        volume += np.bincount(owner[shell:], balance[shell:] * cells, count) * (side**3 * SHELL_DEPTH)
+        volume[self._cameras(sights, tets)] += CAMERA * side**3
+        evidence = np.bincount(owner[:shell], votes[:shell], count) / within
+        looked = np.bincount(owner[shell:], minlength=count)
+        evidence = np.maximum(evidence, np.bincount(owner[shell:], votes[shell:], count) / np.maximum(looked, 1))
+        cost = np.empty((count, 4), np.int32)
+        weigh = side, self.aligned, self.sure, self.certain
+        native.price(
+            tets.points,
+            tets.corners,
+            tets.neighbours,
+            points.normals,
+            evidence.astype(np.float32),
+            *weigh,
+            cost,
+            threads,
+        )
+        most = cost.sum(1, dtype=np.int64) + 1  # from there on, no neighbour turns a tetrahedron over
+        bias = np.rint(volume * (native.CUT_UNITS / (self.area * side**3)))
+        bias = np.clip(bias, -most, most).astype(np.int64)
+        sides = np.empty(count, np.uint8)
+        native.minimum_cut(tets.neighbours, cost, bias, sides)
+        inside = sides == 1
+        rows, corner = np.nonzero(inside[:, None] & (tets.neighbours >= 0) & ~inside[tets.neighbours])
+        faces = np.take_along_axis(tets.corners[rows], OUTWARD[corner], 1)
+        return faces[(faces < len(points.places)).all(1)]
+
+    def _cameras(self, sights: Sights, tets: Tetrahedra) -> np.ndarray:
+        """Numbers of the tetrahedra that hold a camera: they are empty."""
+        centres = np.stack([camera.centre.numpy() for camera in sights.cameras]).astype(np.float64)
+        found, start = np.empty(len(centres), np.int32), np.zeros(len(centres), np.int32)
+        module().locate(tets.points, tets.corners, tets.neighbours, centres, start, found, torch.get_num_threads())
+        return found[found >= 0]
+
+    def _places(
+        self, points: Points, tets: Tetrahedra, volumes: np.ndarray, side: float
+    ) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray]:
+        """Where votes are asked for: within each tetrahedron, and before and behind each point.
+
+        Returns:
+            (N,) int32 tetrahedron of each place, how many places are of the first kind, the first of these of each
+            tetrahedron, (N, 3) float32 the places, and (M,) float32 how many cells those of the second kind stand for.
+        """
+        native, threads = module(), torch.get_num_threads()
+        count = len(tets.corners)
+        within = np.clip((2 / side * np.cbrt(volumes)).astype(np.int64), 1, MOST_PLACES)
+        starts = np.cumsum(within) - within
+        owner = np.repeat(np.arange(count, dtype=np.int32), within)
+        turn = np.arange(len(owner)) - starts[owner]
+        inner = np.empty((len(owner), 3), np.float32)
+        for at in range(0, len(owner), 1 << 20):
+            part = slice(at, at + (1 << 20))
+            corners = tets.points[tets.corners[owner[part]]]
+            inner[part] = np.einsum("nk,nki->ni", SPREAD[turn[part]], corners)
+        of_point = np.zeros(len(points.places), np.int32)
+        mine = tets.corners < len(points.places)
+        of_point[tets.corners[mine]] = np.nonzero(mine)[0]
+        known = np.flatnonzero((points.normals**2).sum(1) > 0.5)
+        outer = np.concatenate([points.places[known] - off * side * points.normals[known] for off in SHELL])
+        found = np.empty(len(outer), np.int32)
+        start = np.tile(of_point[known], len(SHELL))
+        native.locate(tets.points, tets.corners, tets.neighbours, outer, start, found, threads)
+        inside = found >= 0
+        outer, found, cells = outer[inside].astype(np.float32), found[inside], np.tile(points.cells[known], len(SHELL))
+        return np.concatenate([owner, found]), len(owner), starts, np.concatenate([inner, outer]), cells[inside]
+
+
+def _spread() -> np.ndarray:
+    """(MOST_PLACES, 4) barycentric coordinates: the middle first, then even over the tetrahedron.
+
+    The R3 sequence (Roberts 2018), sorted into gaps, as uniform coordinates of a simplex are.
+    """
+    root = 1.2207440846057596
+    cube = (0.5 + np.arange(1, MOST_PLACES)[:, None] * root ** -np.arange(1.0, 4.0)) % 1
+    gaps = np.diff(np.sort(cube, 1), axis=1, prepend=0.0, append=1.0)
+    return np.concatenate([np.full((1, 4), 0.25), gaps])
+
+
+SPREAD = _spread()
+
+
+@dataclass(frozen=True)
+class Points:
+    """Means of what views see.
+
+    Attributes:
+        places: (P, 3) float64 local.
+        normals: (P, 3) float32 of length 1, or 0 where they are not known.
+        colors: (P, 3) uint8.
+        cells: (P,) float32 how many cells each stands for.
+    """
+
+    places: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    cells: np.ndarray
+
+
+def gather(sights: Sights, side: float, limit: float, least_weight: float, flat: float) -> Points:
+    """One point for each cell of a lattice where depth has some weight.
+
+    Args:
+        sights: What the views see.
+        side: Of a cell, local units.
+        limit: Depth from which nothing counts, local units.
+        least_weight: Sum of the weights of the pixels of a cell that has a point.
+    """
+    native = module()
+    half = 1 << (native.CELL_BITS - 1)
+    cells = native.Cells(side, [-half] * 3, [half] * 3)
+    for_all(sights, "gathering points", lambda sight: cells.add(*sight.native, limit))
+    keys, sums = cells.rows()
+    kept = sums[:, 0] >= least_weight
+    keys, sums = keys[kept], sums[kept]
+    cell = (np.stack([keys >> 2 * native.CELL_BITS, keys >> native.CELL_BITS, keys], 1) & (2 * half - 1)) - half
+    sums[:, 1:4] += sums[:, :1] * (cell * side)
+    sums = np.concatenate([sums, np.ones((len(sums), 1))], 1)
+    for _ in range(LEVELS):
+        cell, sums = merged(cell >> 1, sums, flat * side)
+    means = sums[:, 1:] / sums[:, :1]
+    lengths = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
+    normals = np.where(lengths > 0.3, means[:, 3:6] / np.maximum(lengths, 1e-12), 0)
+    colors = np.rint(means[:, 6:9]).astype(np.uint8)
+    return Points(means[:, :3], normals.astype(np.float32), colors, sums[:, 10].astype(np.float32))
+
+
+LEVELS = 2
+"""How often points on a plane become one for eight cells."""
+ALIKE = 0.95
+"""Length of the mean of the normals of points that become one."""
+
+
+def merged(cell: np.ndarray, sums: np.ndarray, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same points, those of one cell as one where they lie on a plane: few are enough there.
+
+    Args:
+        cell: (P, 3) int64 cell of each.
+        sums: (P, 11) weight, by it positions, normals and colours, and cells.
+        thickness: Standard deviation from the plane up to which they lie on it.
+
+    Returns:
+        (Q, 3) int64 and (Q, 11), in no order.
+    """
+    if not len(cell):
+        return cell, sums
+    order = np.lexsort(cell.T)
+    cell, sums = cell[order], sums[order]
+    first = np.flatnonzero(np.concatenate([[True], (cell[1:] != cell[:-1]).any(1)]))
+    group = np.repeat(np.arange(len(first)), np.diff(first, append=len(cell)))
+    total = np.add.reduceat(sums, first)
+    off = sums[:, 1:4] / sums[:, :1] - (total[:, 1:4] / total[:, :1])[group]
+    spread = np.stack([sums[:, 0] * off[:, i] * off[:, j] for i in range(3) for j in range(i, 3)], 1)
+    spread = np.add.reduceat(spread, first) / total[:, :1]
+    full = spread[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    least = np.linalg.eigvalsh(full)[:, 0]
+    agree = np.linalg.norm(total[:, 4:7], axis=1) > ALIKE * np.add.reduceat(np.linalg.norm(sums[:, 4:7], axis=1), first)
+    joined = (least < thickness**2) & agree
+    stays = ~joined[group]
+    return np.concatenate([cell[first[joined]], cell[stays]]), np.concatenate([total[joined], sums[stays]])
+
+
+def supported(sights: Sights, points: np.ndarray, faces: np.ndarray, side: float, guesses: float) -> np.ndarray:
+    """(F,) bool: faces whose middle some view confirms, and those less than `guesses` cells from one along the surface.
+
+    Args:
+        sights: What the views see.
+        points: (P, 3) local.
+        faces: (F, 3) rows of points.
+        side: Of a cell, local units.
+        guesses: See above.
+    """
+    native, threads = module(), torch.get_num_threads()
+    corners = points[faces]
+    middles = corners.mean(1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    support, views = np.zeros((2, len(faces)), np.float32)
+    at = middles.astype(np.float32), normals.astype(np.float32)
+    for_all(sights, "confirming", lambda s: native.confirm(*at, 0.5 * side, support, views, *s.native, threads))
+    distance = np.where(support > RELIABLE, 0.0, np.inf)
+    a, b = beside(faces)
+    open_ = (distance[a] > 0) | (distance[b] > 0)
+    a, b = a[open_], b[open_]
+    apart = np.linalg.norm(middles[a] - middles[b], axis=1)
+    while True:
+        before = distance.copy()
+        np.minimum.at(distance, a, before[b] + apart)
+        np.minimum.at(distance, b, before[a] + apart)
+        distance[distance > guesses * side] = np.inf
+        if (distance == before).all():
+            return np.isfinite(distance)
+
+
+def facts(side: float, limit: float, frame: Frame) -> dict[str, Any]:
+    """The lengths for mesh.json, in units of the data set and in metres where they are known."""
+    values, metres = {"cell": side, "depth_limit": limit}, frame.local_metres
+    found = {name: value / frame.scale for name, value in values.items()}
+    return found | ({f"{name}_m": value * metres for name, value in values.items()} if metres else {})
