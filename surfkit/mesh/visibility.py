@@ -18,17 +18,19 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
-from surfkit.mesh.adjust import adjusted, beside
+from surfkit.mesh.adjust import adjusted
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.closed import apart, separated
 from surfkit.mesh.delaunay import Tetrahedra, tetrahedralised
 from surfkit.mesh.lengths import look, with_unit
+from surfkit.mesh.manifold import apart, separated
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which
+from surfkit.mesh.points import Points, gather
 from surfkit.mesh.sights import Seeing, Sights, for_all, seen
 from surfkit.mesh.sky import may_show_sky, without_sky
+from surfkit.mesh.support import supported
 from surfkit.mesh.trust import Trust
 from surfkit.native import module
 from surfkit.scene.lengths import Length, check_length, to_local
@@ -51,8 +53,6 @@ POINT_BYTES = 2_000
 LEAST_POINTS = 4
 CAMERA = 1e3
 """Volume that a camera stands for in the tetrahedron that holds it, cells."""
-RELIABLE = 0.3
-"""Sum of the weights of the depths at the middle of a face from which they confirm it."""
 
 
 LIMITS = (
@@ -72,6 +72,7 @@ LIMITS = (
     ("sure", 0.001, 1),
     ("hidden", 0, 10),
     ("damping", 0.001, 1000),
+    ("least_views", 1, 100),
     ("guesses", 0, 1e6),
     ("smooth", 0.001, 1000),
     ("longest", 2, 1000),
@@ -147,8 +148,12 @@ class Visibility(Mesher):
     damping: float = 0.25
     """Sum of votes at which they count half."""
 
+    least_views: int = 2
+    """Photographs that must confirm a place on the surface."""
+
     guesses: float = 6.0
-    """How far the surface goes on where no view confirms it, in cells: what is left are gaps that are closed."""
+    """How far the surface goes on where fewer confirm it, in cells: what is left are gaps that are closed. 0 leaves
+    them open, a large number keeps all."""
 
     smooth: float = 1.0
     """Weight of the faces around a vertex, where 1 is that of a pixel that is fully trusted, when vertices are moved to
@@ -250,7 +255,7 @@ class Visibility(Mesher):
             [np.linalg.norm(tets.points[faces[:, i]] - tets.points[faces[:, i - 1]], axis=1) for i in range(3)], 0
         )
         faces = faces[far < self.longest * side]
-        faces = faces[supported(sights, tets.points, faces, side, self.guesses)]
+        faces = faces[supported(sights, tets.points, faces, side, self.least_views, self.guesses)]
         used, at = np.unique(faces, return_inverse=True)
         mesh = Mesh(tets.points[used].astype(np.float32), at.reshape(-1, 3).astype(np.int32), points.colors[used])
         if not len(faces):
@@ -357,118 +362,6 @@ def _spread() -> np.ndarray:
 
 
 SPREAD = _spread()
-
-
-@dataclass(frozen=True)
-class Points:
-    """Means of what views see.
-
-    Attributes:
-        places: (P, 3) float64 local.
-        normals: (P, 3) float32 of length 1, or 0 where they are not known.
-        colors: (P, 3) uint8.
-        cells: (P,) float32 how many cells each stands for.
-    """
-
-    places: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
-    cells: np.ndarray
-
-
-def gather(sights: Sights, side: float, limit: float, least_weight: float, flat: float) -> Points:
-    """One point for each cell of a lattice where depth has some weight.
-
-    Args:
-        sights: What the views see.
-        side: Of a cell, local units.
-        limit: Depth from which nothing counts, local units.
-        least_weight: Sum of the weights of the pixels of a cell that has a point.
-    """
-    native = module()
-    half = 1 << (native.CELL_BITS - 1)
-    cells = native.Cells(side, [-half] * 3, [half] * 3)
-    for_all(sights, "gathering points", lambda sight: cells.add(*sight.native, limit))
-    keys, sums = cells.rows()
-    kept = sums[:, 0] >= least_weight
-    keys, sums = keys[kept], sums[kept]
-    cell = (np.stack([keys >> 2 * native.CELL_BITS, keys >> native.CELL_BITS, keys], 1) & (2 * half - 1)) - half
-    sums[:, 1:4] += sums[:, :1] * (cell * side)
-    sums = np.concatenate([sums, np.ones((len(sums), 1))], 1)
-    for _ in range(LEVELS):
-        cell, sums = merged(cell >> 1, sums, flat * side)
-    means = sums[:, 1:] / sums[:, :1]
-    lengths = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
-    normals = np.where(lengths > 0.3, means[:, 3:6] / np.maximum(lengths, 1e-12), 0)
-    colors = np.rint(means[:, 6:9]).astype(np.uint8)
-    return Points(means[:, :3], normals.astype(np.float32), colors, sums[:, 10].astype(np.float32))
-
-
-LEVELS = 2
-"""How often points on a plane become one for eight cells."""
-ALIKE = 0.95
-"""Length of the mean of the normals of points that become one."""
-
-
-def merged(cell: np.ndarray, sums: np.ndarray, thickness: float) -> tuple[np.ndarray, np.ndarray]:
-    """The same points, those of one cell as one where they lie on a plane: few are enough there.
-
-    Args:
-        cell: (P, 3) int64 cell of each.
-        sums: (P, 11) weight, by it positions, normals and colours, and cells.
-        thickness: Standard deviation from the plane up to which they lie on it.
-
-    Returns:
-        (Q, 3) int64 and (Q, 11), in no order.
-    """
-    if not len(cell):
-        return cell, sums
-    order = np.lexsort(cell.T)
-    cell, sums = cell[order], sums[order]
-    first = np.flatnonzero(np.concatenate([[True], (cell[1:] != cell[:-1]).any(1)]))
-    group = np.repeat(np.arange(len(first)), np.diff(first, append=len(cell)))
-    total = np.add.reduceat(sums, first)
-    off = sums[:, 1:4] / sums[:, :1] - (total[:, 1:4] / total[:, :1])[group]
-    spread = np.stack([sums[:, 0] * off[:, i] * off[:, j] for i in range(3) for j in range(i, 3)], 1)
-    spread = np.add.reduceat(spread, first) / total[:, :1]
-    full = spread[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    least = np.linalg.eigvalsh(full)[:, 0]
-    agree = np.linalg.norm(total[:, 4:7], axis=1) > ALIKE * np.add.reduceat(np.linalg.norm(sums[:, 4:7], axis=1), first)
-    joined = (least < thickness**2) & agree
-    stays = ~joined[group]
-    return np.concatenate([cell[first[joined]], cell[stays]]), np.concatenate([total[joined], sums[stays]])
-
-
-def supported(sights: Sights, points: np.ndarray, faces: np.ndarray, side: float, guesses: float) -> np.ndarray:
-    """(F,) bool: faces whose middle some view confirms, and those less than `guesses` cells from one along the surface.
-
-    Args:
-        sights: What the views see.
-        points: (P, 3) local.
-        faces: (F, 3) rows of points.
-        side: Of a cell, local units.
-        guesses: See above.
-    """
-    native, threads = module(), torch.get_num_threads()
-    corners = points[faces]
-    middles = corners.mean(1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    support, views = np.zeros((2, len(faces)), np.float32)
-    at = middles.astype(np.float32), normals.astype(np.float32)
-    for_all(sights, "confirming", lambda s: native.confirm(*at, 0.5 * side, support, views, *s.native, threads))
-    distance = np.where(support > RELIABLE, 0.0, np.inf)
-    a, b = beside(faces)
-    open_ = (distance[a] > 0) | (distance[b] > 0)
-    a, b = a[open_], b[open_]
-    apart = np.linalg.norm(middles[a] - middles[b], axis=1)
-    while True:
-        before = distance.copy()
-        np.minimum.at(distance, a, before[b] + apart)
-        np.minimum.at(distance, b, before[a] + apart)
-        distance[distance > guesses * side] = np.inf
-        if (distance == before).all():
-            return np.isfinite(distance)
 
 
 def facts(side: float, limit: float, frame: Frame) -> dict[str, Any]:

@@ -19,9 +19,10 @@ from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
 from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import Report, clean
-from surfkit.mesh.closed import apart, closed, require_closed
+from surfkit.mesh.closed import closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import forget_spooled
+from surfkit.mesh.manifold import apart
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require_kernels, simplified
 from surfkit.mesh.stereo import points

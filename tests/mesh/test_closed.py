@@ -6,9 +6,10 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.closed import apart, closed, open_or_crowded, separated
+from surfkit.mesh.closed import closed, open_or_crowded
 from surfkit.mesh.files import write_mesh
 from surfkit.mesh.holes import edges
+from surfkit.mesh.manifold import apart, separated
 from surfkit.scene.scene import Frame
 
 trimesh = needs("trimesh")

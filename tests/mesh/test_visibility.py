@@ -12,10 +12,12 @@ from surfkit.core.events import Warned
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh.adjust import adjusted, face_normals
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.closed import open_or_crowded, separated
+from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
+from surfkit.mesh.manifold import separated
+from surfkit.mesh.points import merged
 from surfkit.mesh.sights import Sight
-from surfkit.mesh.visibility import Visibility, merged
+from surfkit.mesh.visibility import Visibility
 from surfkit.native import module
 from surfkit.testing import check_mesher
 

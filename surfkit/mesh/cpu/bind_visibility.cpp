@@ -102,10 +102,9 @@ void add_visibility(nb::module_& m) {
         const VoteJob job{places.data(), (float)noise, (float)thickness, empty.data(), full.data()};
         in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), (int64_t)places.shape(0), threads, vote);
     });
-    m.def("confirm", [](In<float> places, In<float> normals, double tolerance, Out<float> support, Out<float> views,
-                        In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
+    m.def("confirm", [](In<float> places, In<float> normals, double tolerance, Out<float> views, In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
                         std::vector<double> pose, int threads) {
-        const ConfirmJob job{places.data(), normals.data(), (float)tolerance, support.data(), views.data()};
+        const ConfirmJob job{places.data(), normals.data(), (float)tolerance, views.data()};
         in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), (int64_t)places.shape(0), threads, confirm);
     });
     m.def("pull", [](In<float> places, In<float> normals, double reach, double near, Out<float> sum, Out<float> total,

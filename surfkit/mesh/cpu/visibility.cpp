@@ -146,14 +146,12 @@ void confirm(const ConfirmJob& job, const Sight& sight, int64_t from, int64_t to
         float n[3];
         const float cosine = facing(sight, s, job.normals + 3 * i, n);
         if (!(cosine > LEAST_FACING)) continue;
-        float most = 0;
+        bool near = false;
         for (int map = 0; map < sight.maps; map++) {
             const float depth = sight.depth[map * pixels + s.pixel], weight = sight.weight[map * pixels + s.pixel];
-            if (!(depth > 0 && weight > 0) || std::fabs(depth - s.z) * cosine > job.tolerance) continue;
-            job.support[i] += weight;
-            most = std::max(most, weight);
+            near = near || (depth > 0 && weight > 0 && std::fabs(depth - s.z) * cosine <= job.tolerance);
         }
-        if (most > 0) job.views[i] += 1;
+        if (near) job.views[i] += 1;
     }
 }
 

@@ -49,7 +49,7 @@ struct ConfirmJob {
     const float* places;   // (count, 3) on a surface
     const float* normals;  // (count, 3) out of it, of length 1
     float tolerance;       // distance along the normal
-    float *support, *views;  // (count) to be added to: weights, and 1 for a view that has some
+    float* views;          // (count) to be added to: 1 for a view with such a depth
 };
 
 void confirm(const ConfirmJob& job, const Sight& sight, int64_t from, int64_t to);
