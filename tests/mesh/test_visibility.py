@@ -17,7 +17,7 @@ from surfkit.mesh.delaunay import tetrahedralised
 from surfkit.mesh.manifold import separated
 from surfkit.mesh.points import merged
 from surfkit.mesh.sights import Sight
-from surfkit.mesh.visibility import Visibility
+from surfkit.mesh.visibility import OUTWARD, Visibility
 from surfkit.native import module
 from surfkit.testing import check_mesher
 
@@ -279,6 +279,19 @@ def test_bodies_that_touch_along_an_edge_come_apart():
     assert boundary_share(mesh) == (0, 1)
     apart = separated(mesh)
     assert boundary_share(apart) == (0, 0) and len(apart.vertices) == 16
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bodies_that_touch_in_every_way_come_apart(seed):
+    """Every second tetrahedron of many is full, at random: sheets have edges, and both of their ends, in common."""
+    random = np.random.default_rng(seed)
+    tets = tetrahedralised(random.random((60, 3)))
+    full = (random.random(len(tets.corners)) < 0.5) & (tets.corners < 60).all(1)
+    rows, corner = np.nonzero(full[:, None] & (tets.neighbours >= 0) & ~full[tets.neighbours])
+    faces = np.take_along_axis(tets.corners[rows], OUTWARD[corner], 1)
+    mesh = Mesh(tets.points.astype(np.float32), faces)
+    assert boundary_share(mesh)[1] > 50
+    assert boundary_share(separated(mesh)) == (0, 0)
 
 
 class Exact:
