@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.mesh.sights import Sights, for_all
+from surfkit.mesh.sights import Sight, Sights, for_all
 from surfkit.native import module
 
 LEVELS = 2
@@ -32,19 +32,30 @@ class Points:
     cells: np.ndarray
 
 
-def gather(sights: Sights, side: float, limit: float, least_weight: float, flat: float) -> Points:
-    """One point for each cell of a lattice where depth has some weight.
+def gather(
+    sights: Sights, side: float, limit: float, least_weight: float, flat: float, most: int = 2**62
+) -> Points | None:
+    """One point for each cell of a lattice where depth has some weight; None if there are more than `most` cells.
 
     Args:
         sights: What the views see.
         side: Of a cell, local units.
         limit: Depth from which nothing counts, local units.
         least_weight: Sum of the weights of the pixels of a cell that has a point.
+        flat: Distance from a plane up to which points on it become one, cells.
+        most: See above.
     """
     native = module()
     half = 1 << (native.CELL_BITS - 1)
     cells = native.Cells(side, [-half] * 3, [half] * 3)
-    for_all(sights, "gathering points", lambda sight: cells.add(*sight.native, limit))
+
+    def add(sight: Sight) -> None:
+        if cells.count <= most:
+            cells.add(*sight.native, limit)
+
+    for_all(sights, "gathering points", add)
+    if cells.count > most:
+        return None
     keys, sums = cells.rows()
     kept = sums[:, 0] >= least_weight
     keys, sums = keys[kept], sums[kept]

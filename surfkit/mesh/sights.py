@@ -143,7 +143,7 @@ def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
     own = how.trust.within(maps, depth, None)
     layers, weights = [torch.where(own > 0, depth, 0.0)], [own]
     prior = None if subject.priors is None else subject.priors[at]
-    if prior is not None:
+    if prior is not None and how.stereo:
         known = (prior.inverse > 1 / how.limit) & (prior.confidence >= how.confident)
         if keep is not None:
             known &= keep

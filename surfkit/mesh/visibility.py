@@ -50,6 +50,8 @@ CONFIDENT = 0.25
 """Confidence of a prior from which its depth counts."""
 POINT_BYTES = 2_000
 """Memory that a point takes, with its tetrahedra and the places in these."""
+CELL_BYTES = 500
+"""Memory that a cell takes while points are gathered."""
 LEAST_POINTS = 4
 CAMERA = 1e3
 """Volume that a camera stands for in the tetrahedron that holds it, cells."""
@@ -215,19 +217,18 @@ class Visibility(Mesher):
 
     def _points(self, sights: Sights, side: float, limit: float, subject: MeshInput) -> tuple[Points, float]:
         """The points of the surface, as many as the memory holds, and the side of their cells, local units."""
-        most, frame = subject.budget_bytes // POINT_BYTES, subject.frame
+        budget, frame = subject.budget_bytes, subject.frame
         while True:
-            points = gather(sights, side, limit, self.least_weight, self.flat)
-            if len(points.places) < LEAST_POINTS:
+            points = gather(sights, side, limit, self.least_weight, self.flat, budget // CELL_BYTES)
+            if points is not None and len(points.places) < LEAST_POINTS:
                 raise BadInput(
                     f"no surface: of cells of {with_unit(side, frame)}, {len(points.places)} have a depth with the "
                     f"weight of --mesh.least-weight {self.least_weight:g}; lower it, or train for more steps"
                 )
-            if len(points.places) <= most:
+            if points is not None and len(points.places) * POINT_BYTES <= budget:
                 return points, side
-            coarser = 1.05 * side * (len(points.places) / most) ** 0.5
-            told = f"{len(points.places):,} points in cells of {with_unit(side, frame)} need {POINT_BYTES} bytes each"
-            told += f", and {subject.budget_bytes / 1e9:.1f} GB may be used"
+            coarser = 1.4 * side
+            told = f"cells of {with_unit(side, frame)} need more than the {budget / 1e9:.1f} GB that may be used"
             if self.cell != "auto":
                 raise BadInput(f"{told}; give --mesh.cell {with_unit(coarser, frame)} or more, or more --memory")
             emit(Warned(f"{told}: cells are made larger, {with_unit(coarser, frame)}; more --memory keeps them"))

@@ -80,6 +80,7 @@ void add_visibility(nb::module_& m) {
                  nb::gil_scoped_release free;
                  self.add(sight, limit);
              })
+        .def_prop_ro("count", [](const Cells& self) { return self.rows; })
         .def("rows", [](const Cells& self) {  // by their keys
             std::vector<int64_t> order(self.rows), keys(self.rows);
             std::vector<double> sums(self.sums.size());
