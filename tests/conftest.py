@@ -3,6 +3,7 @@
 import gc
 import importlib
 import os
+import signal
 import sys
 import types
 from dataclasses import dataclass, field
@@ -209,6 +210,14 @@ def own_cache(tmp_path_factory, monkeypatch):
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("SURFKIT_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture
+def hangs_up():
+    """A closed terminal ends this process by default, also where the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @pytest.fixture

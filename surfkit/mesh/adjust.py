@@ -15,6 +15,8 @@ ROUNDS = 2
 """How often vertices are looked for in the views."""
 STEPS = 3
 """How often they are moved each time."""
+TURNED = 0.3
+"""Cosine between the normals of a face before and after, below which its corners stay where they were."""
 FILTERS = 3
 """How often normals are averaged in each round."""
 APART = 0.35
@@ -42,11 +44,13 @@ def adjusted(sights: Sights, mesh: Mesh, reach: float, near: float, smooth: floa
     places, faces = mesh.vertices.astype(np.float64), mesh.faces
     for _ in range(ROUNDS):
         seen = Pulled.of(sights, places, vertex_normals(places, faces), reach, near)
-        level = filtered(face_normals(places, faces)[0], faces)
+        before = face_normals(places, faces)[0]
+        level = filtered(before, faces)
         share = (seen.weights / (seen.weights + smooth))[:, None]
-        wanted = seen.wanted
+        moved = places
         for _ in range(STEPS):
-            places = places + share * (wanted - places) + (1 - share) * to_planes(places, faces, level)
+            moved = moved + share * (seen.wanted - moved) + (1 - share) * to_planes(moved, faces, level)
+        places = without_folds(places, moved, faces, before)
     seen = Pulled.of(sights, places, vertex_normals(places, faces), reach, near)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(np.where(seen.weights > 0, seen.squares / seen.weights, np.nan))
@@ -80,6 +84,23 @@ class Pulled:
         for_all(sights, "adjusting", lambda sight: native.pull(*at, reach, near, *found, *sight.native, threads))
         wanted = places + normals * (sums / np.maximum(weights, 1e-6))[:, None]
         return Pulled(wanted, weights, squares, views)
+
+
+def without_folds(places: np.ndarray, moved: np.ndarray, faces: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(V, 3) moved places, but for the corners of faces that would turn over: these stay.
+
+    Args:
+        places: (V, 3) before.
+        moved: (V, 3) after.
+        faces: (F, 3).
+        before: (F, 3) unit normals at the places before.
+    """
+    moved = moved.copy()
+    while len(turned := faces[(face_normals(moved, faces)[0] * before).sum(1) < TURNED]):
+        if (moved[turned] == places[turned]).all():
+            break
+        moved[turned] = places[turned]
+    return moved
 
 
 def to_planes(places: np.ndarray, faces: np.ndarray, level: np.ndarray) -> np.ndarray:

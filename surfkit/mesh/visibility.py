@@ -273,9 +273,12 @@ class Visibility(Mesher):
         owner, shell, starts, places, cells = self._places(points, tets, volumes, side)
         empty, full = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
 
+        firsts = np.arange(0, len(places), native.PIECE)
+        boxes = np.concatenate([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)], 1)
+
         def vote(sight: Any) -> None:
             noise = self.noise_px / min(sight.camera.fx, sight.camera.fy) + self.noise
-            native.vote(places, noise, self.thickness, empty, full, *sight.native, threads)
+            native.vote(places, boxes, noise, self.thickness, empty, full, *sight.native, threads)
 
         for_all(sights, "voting", vote)
         votes = empty + full
@@ -346,9 +349,13 @@ class Visibility(Mesher):
         found = np.empty(len(outer), np.int32)
         start = np.tile(of_point[known], len(SHELL))
         native.locate(tets.points, tets.corners, tets.neighbours, outer, start, found, threads)
-        inside = found >= 0
-        outer, found, cells = outer[inside].astype(np.float32), found[inside], np.tile(points.cells[known], len(SHELL))
-        return np.concatenate([owner, found]), len(owner), starts, np.concatenate([inner, outer]), cells[inside]
+        rows = np.argsort(found, kind="stable")[(found < 0).sum() :]  # places that are near come together
+        outer, found, cells = (
+            outer[rows].astype(np.float32),
+            found[rows],
+            np.tile(points.cells[known], len(SHELL))[rows],
+        )
+        return np.concatenate([owner, found]), len(owner), starts, np.concatenate([inner, outer]), cells
 
 
 def _spread() -> np.ndarray:

@@ -232,7 +232,7 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_sigterm_and_a_closed_terminal_are_an_interrupt(monkeypatch, capsys, number):
+def test_sigterm_and_a_closed_terminal_are_an_interrupt(monkeypatch, capsys, hangs_up, number):
     before, after = signal.getsignal(number), []
 
     def asked():

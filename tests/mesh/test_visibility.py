@@ -212,7 +212,8 @@ def test_votes_by_the_distance_from_the_plane_of_a_pixel():
     depths = np.array([0.5, 1.9, 1.99, 2.0, 2.005, 2.02, 2.035, 2.05, 3.0, -1.0])
     places = (centre + depths[:, None] * forward).astype(np.float32)
     empty, full = np.zeros((2, len(depths)), np.float32)
-    module().vote(places, 0.01, 2.0, empty, full, *view.native, 1)
+    boxes = np.concatenate([places.min(0), places.max(0)])[None]
+    module().vote(places, boxes, 0.01, 2.0, empty, full, *view.native, 1)
     column, row = view.camera.cx, view.camera.cy
     assert 0 <= column < 16 and 0 <= row < 12
     before = (2.0 - depths) * 0.8 / 0.02
@@ -220,6 +221,24 @@ def test_votes_by_the_distance_from_the_plane_of_a_pixel():
     behind = 0.5 * np.minimum(np.minimum(-before, 1), 2 * (1 + before / 2))
     assert np.allclose(empty, wanted, atol=1e-4)
     assert np.allclose(full, np.where((before < 0) & (before > -2) & (depths > 0), behind, 0), atol=1e-4)
+
+
+def test_pieces_out_of_sight_are_passed_over_and_no_others():
+    view, random = sight(6.0, 0.5), np.random.default_rng(0)
+    count = 20 * module().PIECE
+    middles = np.repeat(random.normal(size=(20, 3)) * 3, module().PIECE, 0)
+    places = (middles + 0.5 * random.normal(size=(count, 3))).astype(np.float32)
+    firsts = np.arange(0, count, module().PIECE)
+    near = np.concatenate([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)], 1)
+    everywhere = np.tile(np.float32([-99] * 3 + [99] * 3), (20, 1))
+    found = np.zeros((2, 2, count), np.float32)
+    for boxes, votes in zip((near, everywhere), found, strict=True):
+        module().vote(places, boxes, 0.01, 2.0, *votes, *view.native, 2)
+    assert np.array_equal(found[0], found[1]) and (found[0, 0] > 0).sum() > 100
+    behind = np.tile(np.float32([-1, -1, -9, 1, 1, -8]), (20, 1))
+    none = np.zeros((2, count), np.float32)
+    module().vote(places, behind, 0.01, 2.0, *none, *view.native, 2)
+    assert not none.any(), "the camera stands at -2, and looks along z"
 
 
 def test_places_are_found():

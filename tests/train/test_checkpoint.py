@@ -177,7 +177,7 @@ def test_columns_that_do_not_fit_are_named(begin, tmp_path):
         load(tmp_path / "c.safetensors")
 
 
-def test_a_closed_terminal_asks_as_often_as_it_is_told_and_not_at_all_where_it_is_ignored():
+def test_a_closed_terminal_asks_as_often_as_it_is_told_and_not_at_all_where_it_is_ignored(hangs_up):
     before = signal.getsignal(signal.SIGHUP)
     with graceful() as request:
         for _ in range(3):  # the shell tells, and the system

@@ -23,7 +23,7 @@ using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
 
-constexpr int64_t PIECE = 1 << 14;
+constexpr int64_t PIECE = 1 << 12;
 
 template <class T>
 nb::ndarray<nb::numpy, T> given(std::vector<T>&& values, std::vector<size_t> shape) {
@@ -97,11 +97,18 @@ void add_visibility(nb::module_& m) {
             const size_t rows = (size_t)self.rows, values = rows ? sums.size() / rows : 10;
             return nb::make_tuple(given(std::move(keys), {rows}), given(std::move(sums), {rows, values}));
         });
-    m.def("vote", [](In<float> places, double noise, double thickness, Out<float> empty, Out<float> full, In<float> depth,
+    m.attr("PIECE") = PIECE;
+    m.def("vote", [](In<float> places, In<float> boxes, double noise, double thickness, Out<float> empty, Out<float> full, In<float> depth,
                      In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
                      std::vector<double> pose, int threads) {
         const VoteJob job{places.data(), (float)noise, (float)thickness, empty.data(), full.data()};
-        in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), (int64_t)places.shape(0), threads, vote);
+        const Sight sight = sight_of(depth, weight, normal, color, lens, pose);
+        const int64_t count = (int64_t)places.shape(0);
+        const float* box = boxes.data();  // of each piece
+        nb::gil_scoped_release free;
+        parallel((int64_t)boxes.shape(0), threads, [&](int64_t at) {
+            if (may_see(sight, box + 6 * at, box + 6 * at + 3)) vote(job, sight, at * PIECE, std::min(count, (at + 1) * PIECE));
+        });
     });
     m.def("confirm", [](In<float> places, In<float> normals, double tolerance, Out<float> views, In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
                         std::vector<double> pose, int threads) {

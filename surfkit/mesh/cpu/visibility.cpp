@@ -119,6 +119,25 @@ void Cells::add(const Sight& sight, double limit) {
         }
 }
 
+bool may_see(const Sight& sight, const float* low, const float* high) {
+    const Lens& l = sight.lens;
+    bool behind = true, left = true, right = true, above = true, below = true;
+    for (int corner = 0; corner < 8; corner++) {
+        double p[3], c[3];
+        for (int i = 0; i < 3; i++) p[i] = corner >> i & 1 ? high[i] : low[i];
+        for (int i = 0; i < 3; i++) {
+            const auto& r = sight.pose.turn[i];
+            c[i] = r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + sight.pose.shift[i];
+        }
+        // Sides of the pyramid of the picture, a pixel wider; they hold for corners behind the camera too.
+        const double u = c[0] * l.fx + l.cx * c[2], v = c[1] * l.fy + l.cy * c[2];
+        behind = behind && c[2] <= 0;
+        left = left && u < -c[2], right = right && u > (l.width + 1) * c[2];
+        above = above && v < -c[2], below = below && v > (l.height + 1) * c[2];
+    }
+    return !(behind || left || right || above || below);
+}
+
 void vote(const VoteJob& job, const Sight& sight, int64_t from, int64_t to) {
     const int64_t pixels = (int64_t)sight.lens.width * sight.lens.height;
     for (int64_t i = from; i < to; i++) {

@@ -45,6 +45,9 @@ struct VoteJob {
 
 void vote(const VoteJob& job, const Sight& sight, int64_t from, int64_t to);
 
+// Whether a view may see some of a box, given by its lowest and its highest corner.
+bool may_see(const Sight& sight, const float* low, const float* high);
+
 struct ConfirmJob {
     const float* places;   // (count, 3) on a surface
     const float* normals;  // (count, 3) out of it, of length 1
