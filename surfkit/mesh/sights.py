@@ -127,7 +127,7 @@ def seen(subject: MeshInput, how: Seeing) -> Iterator[Sights]:
         for at in range(len(views)):
             weight = np.load(folder / f"{at}-weight.npy")
             among = how.trust.among(at, depths).numpy()
-            weight[0] = np.where(weight[0] > 0, np.maximum(among, how.doubted), 0)
+            weight[0] *= np.maximum(among, how.doubted)  # 0 stays 0: what the view itself does not trust
             sights.write(at, weight=weight)
             emit(Progress("comparing views", at + 1, len(views)))
         yield sights
@@ -140,9 +140,9 @@ def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
     depth = torch.where(depth <= how.limit, depth, 0.0)
     if keep is not None:
         depth = torch.where(keep, depth, 0.0)
-    own = how.trust.within(maps, depth, None)
-    layers, weights = [torch.where(own > 0, depth, 0.0)], [own]
     prior = None if subject.priors is None else subject.priors[at]
+    own = how.trust.within(maps, depth, prior if how.trust.needs_prior else None)
+    layers, weights = [torch.where(own > 0, depth, 0.0)], [own]
     if prior is not None and how.stereo:
         known = (prior.inverse > 1 / how.limit) & (prior.confidence >= how.confident)
         if keep is not None:

@@ -174,11 +174,12 @@ class Visibility(Mesher):
     @property
     def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
-        return not self.sky or self.stereo > 0
+        return not self.sky or self.stereo > 0 or self.trust.needs_prior
 
     def needs_prior_of(self, views: list[View], frame: Frame) -> bool:
         """See `Mesher.needs_prior_of`."""
-        return self.stereo > 0 or (not self.sky and may_show_sky(views, up_of_views(views, frame)))
+        wanted = self.stereo > 0 or self.trust.needs_prior
+        return wanted or (not self.sky and may_show_sky(views, up_of_views(views, frame)))
 
     def refuse_unfit(self, frame: Frame) -> None:
         """See `Mesher.refuse_unfit`."""
@@ -203,6 +204,7 @@ class Visibility(Mesher):
         if self.largest_px and subject.draw_of is not None:
             subject = without_oversized(subject, self.largest_px, self.depth)
         side, limit = self._lengths(subject)
+        refuse_too_fine(side, limit, subject)
         subject = oversampled(subject, self.oversampling)
         how = Seeing(self.depth, limit, self.trust, self.doubted, self.stereo, CONFIDENT)
         with seen(subject, how) as sights:
@@ -210,8 +212,8 @@ class Visibility(Mesher):
             mesh = self.surface(sights, points, side)
         if not len(mesh.faces):
             raise BadInput(
-                "no surface: no face between what is seen through and what is not is confirmed by a view; train for "
-                "more steps"
+                "no surface: between what is seen through and what is not, no place is confirmed by --mesh.least-views "
+                f"{self.least_views}; lower it, or train for more steps"
             )
         return replace(mesh, facts=facts(side, limit, subject.frame) | {"points": len(points.places)})
 
@@ -370,6 +372,18 @@ def _spread() -> np.ndarray:
 
 
 SPREAD = _spread()
+
+
+def refuse_too_fine(side: float, limit: float, subject: MeshInput) -> None:
+    """BadInput if cells of a side cannot be numbered as far as views see; lengths in local units."""
+    centres = torch.stack([view.camera.centre for view in subject.views]).abs()
+    farthest, most = float(centres.max()) + limit, (1 << (module().CELL_BITS - 1)) - 1
+    if farthest > most * side:
+        least, frame = 1.01 * farthest / most, subject.frame
+        raise BadInput(
+            f"mesh.cell is {with_unit(side, frame)}, too small for a scene of {with_unit(2 * farthest, frame)}; give "
+            f"{with_unit(least, frame)} or more, or a lower --mesh.depth-limit"
+        )
 
 
 def facts(side: float, limit: float, frame: Frame) -> dict[str, Any]:

@@ -11,12 +11,14 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh.adjust import adjusted, face_normals
+from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
 from surfkit.mesh.manifold import separated
 from surfkit.mesh.points import merged
-from surfkit.mesh.sights import Sight
+from surfkit.mesh.sights import Seeing, Sight
+from surfkit.mesh.sights import seen as seen_by_all
 from surfkit.mesh.visibility import OUTWARD, Visibility
 from surfkit.native import module
 from surfkit.testing import check_mesher
@@ -187,6 +189,27 @@ def test_little_memory_makes_cells_larger_or_says_what_to_give():
 def test_settings_that_are_refused(change, said):
     with pytest.raises(BadInput, match=said):
         replace(PLAIN, **change)
+
+
+def test_cells_that_cannot_be_numbered_are_refused():
+    with pytest.raises(BadInput, match=r"mesh.cell is 1e-06 m, too small for a scene of .* m; give .* or more"):
+        replace(PLAIN, cell=1e-6).mesh(subject(CAMERAS, sphere))
+
+
+def test_what_a_view_itself_trusts_less_weighs_less():
+    """The spread of the splats along the ray halves the weight at its value, as when depth maps are fused."""
+    given = subject(CAMERAS, sphere)
+
+    def spread(view):
+        maps = given.draw(view)
+        return replace(maps, depth=1.01 * maps.depth)
+
+    weights = []
+    for trust in (Agreement(), Agreement(spread=0.01)):
+        with seen_by_all(replace(given, draw=spread), Seeing("median", 10.0, trust, 0.05, 0.0, 0.25)) as sights:
+            weights.append(sights[0].weight[0])
+    there = weights[0] > 0
+    assert there.sum() > 100 and np.allclose(weights[1][there] / weights[0][there], 0.5, atol=0.01)
 
 
 def test_nothing_to_mesh():

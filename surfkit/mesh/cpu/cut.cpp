@@ -215,10 +215,11 @@ class Cut {
     std::vector<int64_t> own;   // room from the source, or, negative, to the sink
     std::vector<int8_t> parent, tree;
     std::vector<uint8_t> queued;
-    std::vector<int32_t> stamp, depth, active, later;
+    std::vector<int64_t> stamp;
+    std::vector<int32_t> depth, active, later;
     std::deque<int32_t> orphans;
     size_t at = 0;
-    int32_t now = 1;
+    int64_t now = 1;
     int64_t flow = 0;
 };
 
