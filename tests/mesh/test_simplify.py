@@ -6,7 +6,7 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.simplify import simplified
+from surfkit.mesh.simplify import simplified, simplify_to
 
 trimesh = needs("trimesh")
 
@@ -121,3 +121,14 @@ def test_without_kernels_it_is_refused(monkeypatch):
     monkeypatch.setattr("surfkit.mesh.simplify.module", lambda: None)
     with pytest.raises(BadInput, match="simplifying a mesh needs the compiled kernels"):
         simplified(relief(), most=10)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e6])
+def test_the_unit_of_lengths_does_not_matter(unit):
+    """It does to fast-simplification, whose limits are lengths: see findings/fast_simplification_units.sh."""
+    needs("fast_simplification")
+    ball = as_mesh(trimesh.creation.icosphere(4))
+    large = Mesh(ball.vertices * np.float32(unit), ball.faces)
+    for less in (simplify_to(large, 500), simplified(large, 500)):
+        assert 480 <= len(less.faces) <= 500
+        assert np.abs(np.linalg.norm(less.vertices / unit, axis=1) - 1).max() < 0.03
