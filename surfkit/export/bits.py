@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from surfkit.scene.morton import morton_order
+
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0."""
 QUARTER = 0.25 / 255
@@ -73,18 +75,6 @@ def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
     return quats
 
 
-def morton_order(means: np.ndarray) -> np.ndarray:
-    """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another."""
-    if not len(means):
-        return np.zeros(0, np.int64)
-    low, high = means.min(0), means.max(0)
-    cells = ((means - low) / np.where(high > low, high - low, 1) * (2**21 - 1)).astype(np.uint64)
-    code = np.zeros(len(means), np.uint64)
-    for axis in range(3):
-        code |= _spread(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(code, kind="stable")
-
-
 def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarray:
     """(N,) indices that sort (N, 3) positions as `morton_order`, with those far from the others together at the end.
 
@@ -110,16 +100,3 @@ def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarr
         octave[filling] = 0
     parts = [np.flatnonzero(octave == each) for each in np.unique(octave)]
     return np.concatenate([part[morton_order(means[part])] for part in parts])
-
-
-def _spread(values: np.ndarray) -> np.ndarray:
-    """21 bits of uint64 with two zeros after each."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        values = (values | values << np.uint64(shift)) & np.uint64(mask)
-    return values

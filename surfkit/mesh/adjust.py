@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.sights import Sights, for_all
+from surfkit.mesh.sights import Sights, boxes_of, for_all
 from surfkit.native import module
 
 ROUNDS = 2
@@ -78,10 +78,10 @@ class Pulled:
     def of(sights: Sights, places: np.ndarray, normals: np.ndarray, reach: float, near: float) -> Pulled:
         """Look at (V, 3) places, whose unit normals are (V, 3), in all views; the lengths are those of `adjusted`."""
         sums, weights, squares, views = np.zeros((4, len(places)), np.float32)
-        at = places.astype(np.float32), normals.astype(np.float32)
+        at = places.astype(np.float32)
         native, threads = module(), torch.get_num_threads()
-        found = sums, weights, squares, views
-        for_all(sights, "adjusting", lambda sight: native.pull(*at, reach, near, *found, *sight.native, threads))
+        job = at, boxes_of(at), normals.astype(np.float32), reach, near, sums, weights, squares, views
+        for_all(sights, "adjusting", lambda sight: native.pull(*job, *sight.native, threads))
         wanted = places + normals * (sums / np.maximum(weights, 1e-6))[:, None]
         return Pulled(wanted, weights, squares, views)
 

@@ -135,11 +135,17 @@ class Tetrahedra:
     neighbours: np.ndarray
 
 
-def tetrahedralised(points: np.ndarray) -> Tetrahedra:
+def tetrahedralised(points: np.ndarray, step: float = 0.0) -> Tetrahedra:
     """The Delaunay tetrahedralisation of (P, 3) float64 points, by the compiled part: 6 us and 250 bytes a point.
 
-    Points are rounded to a millionth of their extent, and are exact from there on; one in the place of another is left
+    Points are rounded to whole multiples of a step, and are exact from there on; one in the place of another is left
     out, as the corner of no tetrahedron. Four points enclose all, so the hull is not exactly convex.
+
+    Args:
+        points: See above.
+        step: 0 for the least that can be had, a millionth of the extent of the points.
     """
-    corners, neighbours, enclosing, _ = module().tetrahedralise(np.ascontiguousarray(points, np.float64))
+    given = np.ascontiguousarray(points, np.float64)
+    step = step or module().least_step(given)
+    corners, neighbours, enclosing, _ = module().tetrahedralise(given, step)
     return Tetrahedra(np.concatenate([points, enclosing]), corners, neighbours)

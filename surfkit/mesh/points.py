@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from surfkit.mesh.delaunay import split
 from surfkit.mesh.sights import Sight, Sights, for_all
 from surfkit.native import module
+from surfkit.scene.morton import morton_order
 
 LEVELS = 2
 """How often points on a plane become one for eight cells."""
@@ -31,11 +35,19 @@ class Points:
     colors: np.ndarray
     cells: np.ndarray
 
+    def take(self, rows: np.ndarray) -> Points:
+        """Those of (N,) rows."""
+        return Points(self.places[rows], self.normals[rows], self.colors[rows], self.cells[rows])
 
-def gather(
-    sights: Sights, side: float, limit: float, least_weight: float, flat: float, most: int = 2**62
-) -> Points | None:
-    """One point for each cell of a lattice where depth has some weight; None if there are more than `most` cells.
+
+COARSE = 4
+"""Cells along each axis of those by which others are counted before there are any."""
+SHARE = 24
+"""Cells that have a point in each of these: 16 where a surface is flat."""
+
+
+def gather(sights: Sights, side: float, limit: float, least_weight: float, flat: float, most: int) -> Points:
+    """One point for each cell of a lattice where depth has some weight, near ones next to each other.
 
     Args:
         sights: What the views see.
@@ -43,23 +55,64 @@ def gather(
         limit: Depth from which nothing counts, local units.
         least_weight: Sum of the weights of the pixels of a cell that has a point.
         flat: Distance from a plane up to which points on it become one, cells.
-        most: See above.
+        most: Cells that may be in memory: more are gathered in boxes, one after the other.
     """
-    native = module()
-    half = 1 << (native.CELL_BITS - 1)
-    cells = native.Cells(side, [-half] * 3, [half] * 3)
+    boxes = boxes_with(sights, side, limit, most)
+    found = []
+    for at, box in enumerate(boxes, 1):
+        cells = module().Cells(side, *box.tolist())
+        ends = np.clip(box * side, *_bounds(sights, limit))
+        what = "gathering points" + (f", box {at} of {len(boxes)}" if len(boxes) > 1 else "")
+        for_all(sights, what, partial(_add, cells, limit), ends if len(boxes) > 1 else None)
+        found.append(_points(*cells.rows(), side, least_weight, flat))
+    points = Points(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Points)))
+    return points.take(morton_order(points.places))
+
+
+def _add(cells: Any, limit: float, sight: Sight) -> None:
+    cells.add(*sight.native, limit)
+
+
+def _bounds(sights: Sights, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) lowest and highest corner of what can be seen up to a depth."""
+    centres = np.stack([camera.centre.numpy() for camera in sights.cameras])
+    return centres.min(0) - 4 * limit, centres.max(0) + 4 * limit
+
+
+def boxes_with(sights: Sights, side: float, limit: float, most: int) -> list[np.ndarray]:
+    """Boxes of cells, (2, 3) int64 from the first up to, without, the second, expected to have `most` points or fewer.
+
+    They fill space, and cells that may become one lie in the same box. Their number is estimated from every fourth
+    pixel and cells four times as large.
+    """
+    half = 1 << (module().CELL_BITS - 1)
+    whole = np.array([[-half] * 3, [half] * 3])
+    coarse = module().Cells(COARSE * side, *whole.tolist())
 
     def add(sight: Sight) -> None:
-        if cells.count <= most:
-            cells.add(*sight.native, limit)
+        camera = sight.camera
+        lens = [camera.fx / COARSE, camera.fy / COARSE]
+        lens += [(middle - 0.5) / COARSE + 0.5 for middle in (camera.cx, camera.cy)]
+        part = [np.ascontiguousarray(values[:, ::COARSE, ::COARSE]) for values in sight.native[:4]]
+        coarse.add(*part, lens, sight.native[5], limit)
 
-    for_all(sights, "gathering points", add)
-    if cells.count > most:
-        return None
-    keys, sums = cells.rows()
+    for_all(sights, "counting points", add)
+    if coarse.count * SHARE <= most:
+        return [whole]
+    boxes = split(cell_of(coarse.rows()[0]) + 0.0, max(most // SHARE, 1))
+    ends = [np.ceil(np.stack(box)) * COARSE for box in boxes]
+    return [np.clip(box, -half, half).astype(np.int64) for box in ends]
+
+
+def cell_of(keys: np.ndarray) -> np.ndarray:
+    """(N, 3) int64 cells with these keys."""
+    bits = module().CELL_BITS
+    return (np.stack([keys >> 2 * bits, keys >> bits, keys], 1) & ((1 << bits) - 1)) - (1 << (bits - 1))
+
+
+def _points(keys: np.ndarray, sums: np.ndarray, side: float, least_weight: float, flat: float) -> Points:
     kept = sums[:, 0] >= least_weight
-    keys, sums = keys[kept], sums[kept]
-    cell = (np.stack([keys >> 2 * native.CELL_BITS, keys >> native.CELL_BITS, keys], 1) & (2 * half - 1)) - half
+    cell, sums = cell_of(keys[kept]), sums[kept]
     sums[:, 1:4] += sums[:, :1] * (cell * side)
     sums = np.concatenate([sums, np.ones((len(sums), 1))], 1)
     for _ in range(LEVELS):

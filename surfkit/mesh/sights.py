@@ -20,6 +20,7 @@ from surfkit.mesh.fusion import TILES
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import Which, depth_of
 from surfkit.mesh.trust import Trust
+from surfkit.native import module
 from surfkit.scene.camera import Camera
 
 PIXEL_BYTES = 18
@@ -162,8 +163,25 @@ def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
 Each = Callable[[Sight], None]
 
 
-def for_all(sights: Sights, what: str, each: Each) -> None:
-    """Call `each` with every sight, and report progress."""
-    for at in range(len(sights)):
+def for_all(sights: Sights, what: str, each: Each, places: np.ndarray | None = None) -> None:
+    """Call `each` with every sight, or those that may see some of (N, 3) places, and report progress."""
+    looking = range(len(sights))
+    if places is not None:
+        looking = [at for at in looking if len(places) and may_see(sights.cameras[at], places.min(0), places.max(0))]
+    for done, at in enumerate(looking, 1):
         each(sights[at])
-        emit(Progress(what, at + 1, len(sights)))
+        emit(Progress(what, done, len(looking)))
+
+
+def may_see(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether a camera may see some of a box with corners (3,)."""
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    pose = camera.world_to_camera.flatten().tolist()
+    return module().may_see([*low.tolist(), *high.tolist()], camera.width, camera.height, lens, pose)
+
+
+def boxes_of(places: np.ndarray) -> np.ndarray:
+    """(K, 6) float32 lowest and highest corner of each `PIECE` of (N, 3) float32 places: what a view does not see of
+    these is passed over."""
+    firsts = np.arange(0, len(places), module().PIECE)
+    return np.concatenate([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)], 1)

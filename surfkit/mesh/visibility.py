@@ -21,14 +21,16 @@ from surfkit.core.registry import choice
 from surfkit.mesh.adjust import adjusted
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.cut_tiles import LAST, UNKNOWN, Decided, Tile, tiles
 from surfkit.mesh.delaunay import Tetrahedra, tetrahedralised
+from surfkit.mesh.holes import close_holes
 from surfkit.mesh.lengths import look, with_unit
 from surfkit.mesh.manifold import apart, separated
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which
 from surfkit.mesh.points import Points, gather
-from surfkit.mesh.sights import Seeing, Sights, for_all, seen
+from surfkit.mesh.sights import Seeing, Sights, boxes_of, for_all, seen
 from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.support import supported
 from surfkit.mesh.trust import Trust
@@ -52,6 +54,10 @@ POINT_BYTES = 2_000
 """Memory that a point takes, with its tetrahedra and the places in these."""
 CELL_BYTES = 500
 """Memory that a cell takes while points are gathered."""
+HALO = 100.0
+"""Cells around a tile whose points it has too."""
+CRACK = 12
+"""Edges of holes that are closed: where tiles meet, a large tetrahedron may have been divided in two ways."""
 LEAST_POINTS = 4
 CAMERA = 1e3
 """Volume that a camera stands for in the tetrahedron that holds it, cells."""
@@ -77,7 +83,6 @@ LIMITS = (
     ("least_views", 1, 100),
     ("guesses", 0, 1e6),
     ("smooth", 0.001, 1000),
-    ("longest", 2, 1000),
 )
 """Of the numbers of `Visibility`: the least and the most."""
 
@@ -153,16 +158,12 @@ class Visibility(Mesher):
     least_views: int = 2
     """Photographs that must confirm a place on the surface."""
 
-    guesses: float = 6.0
-    """How far the surface goes on where fewer confirm it, in cells: what is left are gaps that are closed. 0 leaves
-    them open, a large number keeps all."""
+    guesses: float = 48.0
+    """Width up to which gaps that fewer confirm are closed, cells. 0 leaves them open, a large number keeps all."""
 
     smooth: float = 1.0
     """Weight of the faces around a vertex, where 1 is that of a pixel that is fully trusted, when vertices are moved to
     where the depth maps have them; more is smoother."""
-
-    longest: float = 12.0
-    """Longest edge of a triangle, cells: across the rim of what is seen lie larger ones."""
 
     def __post_init__(self) -> None:
         for name in ("cell", "depth_limit"):
@@ -208,33 +209,20 @@ class Visibility(Mesher):
         subject = oversampled(subject, self.oversampling)
         how = Seeing(self.depth, limit, self.trust, self.doubted, self.stereo, CONFIDENT)
         with seen(subject, how) as sights:
-            points, side = self._points(sights, side, limit, subject)
-            mesh = self.surface(sights, points, side)
+            most = subject.budget_bytes // CELL_BYTES
+            points = gather(sights, side, limit, self.least_weight, self.flat, most)
+            if len(points.places) < LEAST_POINTS:
+                raise BadInput(
+                    f"no surface: of cells of {with_unit(side, subject.frame)}, {len(points.places)} have a depth with "
+                    f"the weight of --mesh.least-weight {self.least_weight:g}; lower it, or train for more steps"
+                )
+            mesh = self.surface(sights, points, side, subject.budget_bytes)
         if not len(mesh.faces):
             raise BadInput(
                 "no surface: between what is seen through and what is not, no place is confirmed by --mesh.least-views "
                 f"{self.least_views}; lower it, or train for more steps"
             )
         return replace(mesh, facts=facts(side, limit, subject.frame) | {"points": len(points.places)})
-
-    def _points(self, sights: Sights, side: float, limit: float, subject: MeshInput) -> tuple[Points, float]:
-        """The points of the surface, as many as the memory holds, and the side of their cells, local units."""
-        budget, frame = subject.budget_bytes, subject.frame
-        while True:
-            points = gather(sights, side, limit, self.least_weight, self.flat, budget // CELL_BYTES)
-            if points is not None and len(points.places) < LEAST_POINTS:
-                raise BadInput(
-                    f"no surface: of cells of {with_unit(side, frame)}, {len(points.places)} have a depth with the "
-                    f"weight of --mesh.least-weight {self.least_weight:g}; lower it, or train for more steps"
-                )
-            if points is not None and len(points.places) * POINT_BYTES <= budget:
-                return points, side
-            coarser = 1.4 * side
-            told = f"cells of {with_unit(side, frame)} need more than the {budget / 1e9:.1f} GB that may be used"
-            if self.cell != "auto":
-                raise BadInput(f"{told}; give --mesh.cell {with_unit(coarser, frame)} or more, or more --memory")
-            emit(Warned(f"{told}: cells are made larger, {with_unit(coarser, frame)}; more --memory keeps them"))
-            side = coarser
 
     def _lengths(self, subject: MeshInput) -> tuple[float, float]:
         """Side of a cell and the largest depth, local units."""
@@ -244,50 +232,69 @@ class Visibility(Mesher):
             side, limit = side or self.cell_px * pixel, limit or max(2 * depth, far)
         return side, limit
 
-    def surface(self, sights: Sights, points: Points, side: float) -> Mesh:
+    def surface(self, sights: Sights, points: Points, side: float, budget_bytes: int = 2**62) -> Mesh:
         """The surface of what views see, without facts.
 
         Args:
             sights: What they see.
             points: On the surface.
             side: Of a cell, local units.
+            budget_bytes: Memory for the tetrahedra of a tile.
         """
-        tets = tetrahedralised(points.places)
-        faces = self.cut(sights, points, tets, side)
-        far = np.max(
-            [np.linalg.norm(tets.points[faces[:, i]] - tets.points[faces[:, i - 1]], axis=1) for i in range(3)], 0
-        )
-        faces = faces[far < self.longest * side]
-        faces = faces[supported(sights, tets.points, faces, side, self.least_views, self.guesses)]
+        decided, found = Decided(), []
+        most = budget_bytes // POINT_BYTES
+        parts = tiles(points.places, most, HALO * side)
+        if (largest := max(len(tile.rows) for tile in parts)) > most:
+            needed, given = (f"{count * POINT_BYTES / 1e9:.1f} GB" for count in (largest, most))
+            emit(
+                Warned(f"the least that can be meshed at once needs about {needed}, and {given} may be used: --memory")
+            )
+        for tile in parts:
+            found.append(self.cut(sights, points.take(tile.rows), side, tile, decided))
+        faces = np.concatenate(found)
+        faces = faces[np.argsort(faces.min(1), kind="stable")]  # as the points: near ones are near
+        faces = faces[supported(sights, points.places, faces, side, self.least_views, self.guesses)]
         used, at = np.unique(faces, return_inverse=True)
-        mesh = Mesh(tets.points[used].astype(np.float32), at.reshape(-1, 3).astype(np.int32), points.colors[used])
+        mesh = Mesh(points.places[used].astype(np.float32), at.reshape(-1, 3).astype(np.int32), points.colors[used])
         if not len(faces):
             return mesh
         near = side * min(min(camera.fx, camera.fy) for camera in sights.cameras)
-        return apart(adjusted(sights, separated(mesh), side, near, self.smooth))
+        mesh = separated(mesh)
+        if len(parts) > 1:
+            mesh, _ = close_holes(mesh, CRACK)
+        return apart(adjusted(sights, mesh, side, near, self.smooth))
 
-    def cut(self, sights: Sights, points: Points, tets: Tetrahedra, side: float) -> np.ndarray:
-        """(F, 3) int32 rows of points: the faces between empty and full tetrahedra, facing outwards."""
+    def cut(self, sights: Sights, points: Points, side: float, tile: Tile, decided: Decided) -> np.ndarray:
+        """(F, 3) rows of all points: the faces of a tile between empty and full tetrahedra, facing outwards.
+
+        Args:
+            sights: What the views see.
+            points: Of the tile.
+            side: Of a cell, local units.
+            tile: See `tiles`.
+            decided: By tiles before; what this one decides is added.
+        """
         native, threads = module(), torch.get_num_threads()
+        tets = tetrahedralised(points.places, tile.step)
+        given = decided.of(tile, tets.corners)
         count = len(tets.corners)
         volumes = np.empty(count)
         native.volumes(tets.points, tets.corners, volumes, threads)
-        owner, shell, starts, places, cells = self._places(points, tets, volumes, side)
+        owner, shell, starts, places, cells = self._places(points, tets, volumes, side, given == UNKNOWN)
         empty, full = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
 
-        firsts = np.arange(0, len(places), native.PIECE)
-        boxes = np.concatenate([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)], 1)
+        boxes = boxes_of(places)
 
         def vote(sight: Any) -> None:
             noise = self.noise_px / min(sight.camera.fx, sight.camera.fy) + self.noise
             native.vote(places, boxes, noise, self.thickness, empty, full, *sight.native, threads)
 
-        for_all(sights, "voting", vote)
+        for_all(sights, "voting" + tile.title, vote, places)
         votes = empty + full
         enclosed = (tets.corners < len(points.places)).all(1)
         hidden = np.where(enclosed, self.hidden, 0).astype(np.float32)
         balance = (empty - full - hidden[owner]) / (votes + self.damping)
-        within = np.diff(starts, append=shell)
+        within = np.maximum(np.diff(starts, append=shell), 1)
         volume = np.bincount(owner[:shell], balance[:shell], count) / within * volumes
         volume += np.bincount(owner[shell:], balance[shell:] * cells, count) * (side**3 * SHELL_DEPTH)
         volume[self._cameras(sights, tets)] += CAMERA * side**3
@@ -309,12 +316,15 @@ class Visibility(Mesher):
         most = cost.sum(1, dtype=np.int64) + 1  # from there on, no neighbour turns a tetrahedron over
         bias = np.rint(volume * (native.CUT_UNITS / (self.area * side**3)))
         bias = np.clip(bias, -most, most).astype(np.int64)
+        bias[given == 1], bias[given == 0] = -most[given == 1], most[given == 0]
         sides = np.empty(count, np.uint8)
         native.minimum_cut(tets.neighbours, cost, bias, sides)
-        inside = sides == 1
-        rows, corner = np.nonzero(inside[:, None] & (tets.neighbours >= 0) & ~inside[tets.neighbours])
+        full = sides == 1
+        decided.add(tile, tets.corners, full)
+        rows, corner = np.nonzero(full[:, None] & (tets.neighbours >= 0) & ~full[tets.neighbours])
         faces = np.take_along_axis(tets.corners[rows], OUTWARD[corner], 1)
-        return faces[(faces < len(points.places)).all(1)]
+        of = tile.tile_of[faces]
+        return tile.rows[faces[(of.min(1) == tile.number) & (of.max(1) < LAST)]]
 
     def _cameras(self, sights: Sights, tets: Tetrahedra) -> np.ndarray:
         """Numbers of the tetrahedra that hold a camera: they are empty."""
@@ -324,7 +334,7 @@ class Visibility(Mesher):
         return found[found >= 0]
 
     def _places(
-        self, points: Points, tets: Tetrahedra, volumes: np.ndarray, side: float
+        self, points: Points, tets: Tetrahedra, volumes: np.ndarray, side: float, asked: np.ndarray
     ) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray]:
         """Where votes are asked for: within each tetrahedron, and before and behind each point.
 
@@ -334,7 +344,7 @@ class Visibility(Mesher):
         """
         native, threads = module(), torch.get_num_threads()
         count = len(tets.corners)
-        within = np.clip((2 / side * np.cbrt(volumes)).astype(np.int64), 1, MOST_PLACES)
+        within = np.where(asked, np.clip((2 / side * np.cbrt(volumes)).astype(np.int64), 1, MOST_PLACES), 0)
         starts = np.cumsum(within) - within
         owner = np.repeat(np.arange(count, dtype=np.int32), within)
         turn = np.arange(len(owner)) - starts[owner]
@@ -351,6 +361,7 @@ class Visibility(Mesher):
         found = np.empty(len(outer), np.int32)
         start = np.tile(of_point[known], len(SHELL))
         native.locate(tets.points, tets.corners, tets.neighbours, outer, start, found, threads)
+        found[(found >= 0) & ~asked[found]] = -1
         rows = np.argsort(found, kind="stable")[(found < 0).sum() :]  # places that are near come together
         outer, found, cells = (
             outer[rows].astype(np.float32),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.cluster.vq import kmeans2
 
-from surfkit.export.bits import morton_order
 from surfkit.export.palette import codebook, nearest, palette
+from surfkit.scene.morton import morton_order
 
 
 def test_a_palette_is_nearly_as_good_as_one_level_of_k_means():

@@ -8,7 +8,7 @@ import torch
 from needs import needs_native
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
+from surfkit.core.events import Progress, Warned
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh.adjust import adjusted, face_normals
 from surfkit.mesh.agreement import Agreement
@@ -16,7 +16,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
 from surfkit.mesh.manifold import separated
-from surfkit.mesh.points import merged
+from surfkit.mesh.points import boxes_with, gather, merged
 from surfkit.mesh.sights import Seeing, Sight
 from surfkit.mesh.sights import seen as seen_by_all
 from surfkit.mesh.visibility import OUTWARD, Visibility
@@ -107,8 +107,8 @@ def test_what_lies_on_an_edge_stays():
     assert np.allclose(kept[:, 2], 12 - np.abs(kept[:, 0] - 8))
 
 
-def test_a_wall_that_no_depth_confirms_is_closed_up_to_a_distance():
-    """A hole in all depth maps: the surface goes on over it by `guesses`."""
+def test_a_wall_that_no_depth_confirms_is_closed_up_to_a_width():
+    """A hole in all depth maps, about ten cells wide."""
     cameras = [look_at((x, y, 2.0), (x, y, 0)) for x in (-0.4, 0.0, 0.4) for y in (-0.4, 0.0, 0.4)]
     given = subject(cameras, slope)
 
@@ -120,7 +120,7 @@ def test_a_wall_that_no_depth_confirms_is_closed_up_to_a_distance():
         there = torch.from_numpy(np.hypot(place[0], place[1]) > 0.15)
         return replace(maps, alpha=maps.alpha * there, depth=maps.depth * there, median=maps.median * there)
 
-    for guesses, closes in ((8.0, True), (1.0, False)):
+    for guesses, closes in ((14.0, True), (5.0, False)):
         mesh = replace(PLAIN, guesses=guesses).mesh(replace(given, draw=holed))
         near = np.hypot(*mesh.vertices[:, :2].T) < 0.2
         free = np.zeros(len(mesh.vertices), bool)
@@ -158,24 +158,58 @@ def test_the_number_of_threads_changes_nothing(ring):
 
 class Listener:
     def __init__(self):
-        self.told = []
+        self.told, self.done = [], set()
 
     @hookimpl
     def surfkit_event(self, event):
-        self.told += [event.text] if isinstance(event, Warned) else []
+        if isinstance(event, Warned):
+            self.told.append(event.text)
+        if isinstance(event, Progress):
+            self.done.add(event.what)
 
 
-def test_little_memory_makes_cells_larger_or_says_what_to_give():
-    given, listener = subject(CAMERAS, torus, budget_bytes=1_000_000), Listener()
+def meshed_with(given, monkeypatch, halo):
+    monkeypatch.setattr("surfkit.mesh.visibility.HALO", halo)
+    listener = Listener()
     plugins().register(listener)
     try:
-        mesh = PLAIN.mesh(given)
+        return PLAIN.mesh(given), listener
     finally:
         plugins().unregister(listener)
-    assert mesh.facts["points"] <= 500
-    assert any("cells are made larger" in text for text in listener.told)
-    with pytest.raises(BadInput, match=r"give --mesh.cell .* or more, or more --memory"):
-        replace(PLAIN, cell=0.3).mesh(given)
+
+
+def test_tiles_meet(ring, monkeypatch):
+    """With little memory the torus is cut in tiles: it is as good, and closed but for a crack or two."""
+    mesh, listener = meshed_with(subject(CAMERAS, torus, budget_bytes=8_000_000), monkeypatch, halo=10.0)
+    assert "voting, tile 4 of 4" in listener.done and not listener.told
+    share, crowded = boundary_share(mesh)
+    assert share < 0.0005 and crowded == 0
+    assert len(mesh.faces) == pytest.approx(len(ring.faces), rel=0.01)
+    off = np.abs(torus(mesh.vertices.astype(float)))
+    assert np.quantile(off, 0.99) < 0.7 * 2.0 / 90
+
+
+def test_tiles_that_know_nothing_of_each_other_do_not_meet(monkeypatch):
+    """What the test before measures: without what is decided, it is another surface in each tile."""
+    monkeypatch.setattr("surfkit.mesh.cut_tiles.Decided.of", lambda self, tile, corners: np.full(len(corners), -1))
+    mesh, _ = meshed_with(subject(CAMERAS, torus, budget_bytes=8_000_000), monkeypatch, halo=10.0)
+    assert boundary_share(mesh)[0] > 0.0005
+
+
+def test_points_are_the_same_however_many_boxes_they_are_gathered_in():
+    how = Seeing("median", 10.0, Agreement(), 0.05, 0.0, 0.25)
+    with seen_by_all(subject(CAMERAS, torus), how) as sights:
+        assert len(boxes_with(sights, 0.03, 10.0, 2_000)) >= 4
+        whole, parts = (gather(sights, 0.03, 10.0, 0.1, 0.05, most) for most in (10**9, 2_000))
+    assert len(whole.places) > 200
+    for name in ("places", "normals", "colors", "cells"):
+        assert np.array_equal(getattr(whole, name), getattr(parts, name))
+
+
+def test_too_little_memory_is_told(monkeypatch):
+    mesh, listener = meshed_with(subject(CAMERAS, torus, budget_bytes=1_000_000), monkeypatch, halo=100.0)
+    assert open_or_crowded(mesh) == 0
+    assert [text for text in listener.told if "can be meshed at once needs about" in text]
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,11 @@ nb::ndarray<nb::numpy, T> given(std::vector<T>&& values, std::vector<size_t> sha
     return nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner);
 }
 
+Pose pose_of(const std::vector<double>& m) {
+    return {{{m.at(0), m.at(1), m.at(2)}, {m.at(4), m.at(5), m.at(6)}, {m.at(8), m.at(9), m.at(10)}},
+            {m.at(3), m.at(7), m.at(11)}};
+}
+
 // The arrays of a view, in the order of Sight.arrays in mesh/sights.py.
 Sight sight_of(const In<float>& depth, const In<float>& weight, const In<float>& normal, const In<uint8_t>& color,
                const std::vector<double>& lens, const std::vector<double>& m) {
@@ -40,17 +45,19 @@ Sight sight_of(const In<float>& depth, const In<float>& weight, const In<float>&
     s.maps = (int)depth.shape(0);
     s.lens = {(int)depth.shape(2), (int)depth.shape(1),  (float)lens.at(0), (float)lens.at(1),
               (float)lens.at(2),   (float)lens.at(3)};
-    s.pose = {{{m.at(0), m.at(1), m.at(2)}, {m.at(4), m.at(5), m.at(6)}, {m.at(8), m.at(9), m.at(10)}},
-              {m.at(3), m.at(7), m.at(11)}};
+    s.pose = pose_of(m);
     return s;
 }
 
+// Pieces of `PIECE` places each, but for those whose boxes (pieces, 6) the view does not see.
 template <class Job>
-void in_pieces(const Job& job, const Sight& sight, int64_t count, int threads,
+void in_pieces(const Job& job, const Sight& sight, const In<float>& boxes, int64_t count, int threads,
                void (*body)(const Job&, const Sight&, int64_t, int64_t)) {
+    const float* box = boxes.data();
     nb::gil_scoped_release free;
-    parallel((count + PIECE - 1) / PIECE, threads,
-             [&](int64_t at) { body(job, sight, at * PIECE, std::min(count, (at + 1) * PIECE)); });
+    parallel((int64_t)boxes.shape(0), threads, [&](int64_t at) {
+        if (may_see(sight, box + 6 * at, box + 6 * at + 3)) body(job, sight, at * PIECE, std::min(count, (at + 1) * PIECE));
+    });
 }
 
 template <class Body>
@@ -103,35 +110,37 @@ void add_visibility(nb::module_& m) {
                      std::vector<double> pose, int threads) {
         const VoteJob job{places.data(), (float)noise, (float)thickness, empty.data(), full.data()};
         const Sight sight = sight_of(depth, weight, normal, color, lens, pose);
-        const int64_t count = (int64_t)places.shape(0);
-        const float* box = boxes.data();  // of each piece
-        nb::gil_scoped_release free;
-        parallel((int64_t)boxes.shape(0), threads, [&](int64_t at) {
-            if (may_see(sight, box + 6 * at, box + 6 * at + 3)) vote(job, sight, at * PIECE, std::min(count, (at + 1) * PIECE));
-        });
+        in_pieces(job, sight, boxes, (int64_t)places.shape(0), threads, vote);
     });
-    m.def("confirm", [](In<float> places, In<float> normals, double tolerance, Out<float> views, In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
+    m.def("may_see", [](std::vector<float> box, int width, int height, std::vector<double> lens, std::vector<double> m) {
+        Sight s{};
+        s.lens = {width, height, (float)lens.at(0), (float)lens.at(1), (float)lens.at(2), (float)lens.at(3)};
+        s.pose = pose_of(m);
+        return may_see(s, box.data(), box.data() + 3);
+    });
+    m.def("confirm", [](In<float> places, In<float> boxes, In<float> normals, double tolerance, Out<float> views, In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color, std::vector<double> lens,
                         std::vector<double> pose, int threads) {
         const ConfirmJob job{places.data(), normals.data(), (float)tolerance, views.data()};
-        in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), (int64_t)places.shape(0), threads, confirm);
+        in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), boxes, (int64_t)places.shape(0), threads, confirm);
     });
-    m.def("pull", [](In<float> places, In<float> normals, double reach, double near, Out<float> sum, Out<float> total,
+    m.def("pull", [](In<float> places, In<float> boxes, In<float> normals, double reach, double near, Out<float> sum, Out<float> total,
                      Out<float> square, Out<float> views, In<float> depth, In<float> weight, In<float> normal, In<uint8_t> color,
                      std::vector<double> lens, std::vector<double> pose, int threads) {
         const PullJob job{places.data(), normals.data(), (float)reach, (float)near,
                           sum.data(),    total.data(),   square.data(), views.data()};
-        in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), (int64_t)places.shape(0), threads, pull);
+        in_pieces(job, sight_of(depth, weight, normal, color, lens, pose), boxes, (int64_t)places.shape(0), threads, pull);
     });
-    m.def("tetrahedralise", [](In<double> points) {
+    m.def("tetrahedralise", [](In<double> points, double step) {
         Tetrahedra found;
         {
             nb::gil_scoped_release free;
-            found = tetrahedralise(points.data(), (int64_t)points.shape(0));
+            found = tetrahedralise(points.data(), (int64_t)points.shape(0), step);
         }
         const size_t count = found.corners.size() / 4;
         return nb::make_tuple(given(std::move(found.corners), {count, 4}), given(std::move(found.neighbours), {count, 4}),
                               given(std::move(found.enclosing), {4, 3}), found.left_out);
     });
+    m.def("least_step", [](In<double> points) { return least_step(points.data(), (int64_t)points.shape(0)); });
     m.def("locate", [](In<double> points, In<int32_t> corners, In<int32_t> neighbours, In<double> places,
                        In<int32_t> starts, Out<int32_t> found, int threads) {
         const Walk walk{points.data(), corners.data(), neighbours.data()};

@@ -7,6 +7,7 @@
 #include <array>
 #include <cmath>
 #include <cstdlib>
+#include <stdexcept>
 #include <utility>
 
 namespace surfkit {
@@ -259,31 +260,49 @@ class Builder {
     std::vector<Tet> made;
 };
 
-}  // namespace
+struct Extent {
+    double middle[3] = {0, 0, 0}, reach = 0;  // of points, and how far the farthest lies from it
+};
 
-Tetrahedra tetrahedralise(const double* points, int64_t count) {
-    Tetrahedra found;
-    double low[3], high[3], middle[3], reach = 0;
+Extent extent_of(const double* points, int64_t count) {
+    Extent found;
+    double low[3], high[3], square = 0;
     for (int i = 0; i < 3; i++) {
         low[i] = high[i] = count ? points[i] : 0;
         for (int64_t p = 1; p < count; p++) {
             low[i] = std::min(low[i], points[3 * p + i]);
             high[i] = std::max(high[i], points[3 * p + i]);
         }
-        middle[i] = (low[i] + high[i]) / 2;
+        found.middle[i] = (low[i] + high[i]) / 2;
     }
     for (int64_t p = 0; p < count; p++) {
-        double square = 0;
-        for (int i = 0; i < 3; i++) square += (points[3 * p + i] - middle[i]) * (points[3 * p + i] - middle[i]);
-        reach = std::max(reach, square);
+        double sum = 0;
+        for (int i = 0; i < 3; i++) sum += (points[3 * p + i] - found.middle[i]) * (points[3 * p + i] - found.middle[i]);
+        square = std::max(square, sum);
     }
-    const double scale = reach > 0 ? RADIUS / std::sqrt(reach) : 1;
+    found.reach = std::sqrt(square);
+    return found;
+}
+
+}  // namespace
+
+double least_step(const double* points, int64_t count) {
+    const double reach = extent_of(points, count).reach;
+    return reach > 0 ? reach / RADIUS : 1;
+}
+
+Tetrahedra tetrahedralise(const double* points, int64_t count, double step) {
+    Tetrahedra found;
+    const Extent extent = extent_of(points, count);
+    if (!(extent.reach <= 1.0001 * RADIUS * step)) throw std::invalid_argument("the step is too small for these points");
+    double middle[3];
+    for (int i = 0; i < 3; i++) middle[i] = std::round(extent.middle[i] / step);  // steps
     std::vector<Place> places(count + 4);
     std::vector<std::pair<uint64_t, int32_t>> order(count);
     for (int64_t p = 0; p < count; p++) {
         std::array<uint32_t, 3> at;
         for (int i = 0; i < 3; i++)
-            at[i] = (uint32_t)std::lround((points[3 * p + i] - middle[i]) * scale + SIDE / 2);
+            at[i] = (uint32_t)(std::llround(points[3 * p + i] / step) - (int64_t)middle[i] + SIDE / 2);
         places[p] = {(int32_t)at[0], (int32_t)at[1], (int32_t)at[2]};
         for (uint32_t& x : at) x >>= BITS - CURVE_BITS;
         const uint64_t chance = mixed((uint64_t)p);
@@ -295,7 +314,7 @@ Tetrahedra tetrahedralise(const double* points, int64_t count) {
     for (int k = 0; k < 4; k++) {
         places[count + k] = around[k];
         const int32_t at[3] = {around[k].x, around[k].y, around[k].z};
-        for (int i = 0; i < 3; i++) found.enclosing.push_back((at[i] - SIDE / 2) / scale + middle[i]);
+        for (int i = 0; i < 3; i++) found.enclosing.push_back((at[i] - SIDE / 2 + middle[i]) * step);
     }
     std::sort(order.begin(), order.end());
     Builder builder(places);

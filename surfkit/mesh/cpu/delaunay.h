@@ -13,7 +13,11 @@ struct Tetrahedra {
     int64_t left_out = 0;             // points in the place of another one
 };
 
-// Points (count, 3), of which those that fall on the same place of a grid of about a millionth of their extent are one.
-Tetrahedra tetrahedralise(const double* points, int64_t count);
+// The least step of the grid for points (count, 3): about a millionth of their extent.
+double least_step(const double* points, int64_t count);
+
+// Points (count, 3), of which those that fall on the same place of a grid are one: it has whole multiples of `step`, so
+// that parts of a set are rounded as the whole is.
+Tetrahedra tetrahedralise(const double* points, int64_t count, double step);
 
 }  // namespace surfkit

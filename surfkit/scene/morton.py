@@ -1,0 +1,30 @@
+"""The order of points along a Z-order curve (Morton 1966)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def morton_order(means: np.ndarray) -> np.ndarray:
+    """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another."""
+    if not len(means):
+        return np.zeros(0, np.int64)
+    low, high = means.min(0), means.max(0)
+    cells = ((means - low) / np.where(high > low, high - low, 1) * (2**21 - 1)).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        code |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(code, kind="stable")
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """21 bits of uint64 with two zeros after each."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values
