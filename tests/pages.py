@@ -10,6 +10,8 @@ PAGES = sorted(
     [
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
+        ROOT / "SECURITY.md",
+        ROOT / ".github" / "PULL_REQUEST_TEMPLATE.md",
         *(ROOT / "docs").glob("*.md"),
         *(ROOT / "plugins").glob("*/README.md"),
         *(ROOT / "examples").glob("*/README.md"),

@@ -87,7 +87,7 @@ def test_without_a_compiler_the_reference_trains(monkeypatch, tmp_path, capsys):
     write_colmap(tmp_path / "data", photograph(Flight(views=4, width=16, height=12, points=30)))
     words = ["recipe:2dgs", "mesh:none", "--steps", "2", "--primitive.sh-degree", "0", "--pictures-every", "0"]
     assert main(["train", *words, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 0
-    assert "without its compiled rasterizer" in capsys.readouterr().err
+    assert "without its compiled kernels" in capsys.readouterr().err
     assert json.loads((tmp_path / "out" / "run.json").read_text())["device"].startswith("cpu reference")
 
 

@@ -70,3 +70,10 @@ def test_the_lowest_versions_are_those_that_were_tried():
     assert core - set(tried) == {"torch"}
     for name, version in tried.items():
         assert any(f"{version}.".startswith(f"{least}.") for least in lowest[name]), (name, version, lowest[name])
+
+
+@pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="surfkit is installed, and is not a checkout")
+def test_the_version_to_cite_is_this_one():
+    said = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = (ROOT / "CITATION.cff").read_text().splitlines()
+    assert f"version: {said['version']}" in lines and f"license: {said['license']}" in lines

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.length import with_usual_steps
-from surfkit.cli.recipes import chosen_recipe, settled
+from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput, printable
 from surfkit.core.codec import dump
@@ -25,6 +25,7 @@ from surfkit.doctor.estimate import Estimate, duration, likely_range
 from surfkit.doctor.examine import Diagnosis, Told, examine
 from surfkit.doctor.finding import LEVELS, Finding
 from surfkit.doctor.forecast import Plan, forecast
+from surfkit.doctor.machine import Machine, machine
 from surfkit.pipeline import with_steps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
@@ -38,16 +39,18 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 class Doctor:
     """Check a data set before training: its contents, all errors in it, and the memory, disk and time of a run.
 
+    Without a data set, tell what surfkit runs on, for a report of a bug: versions, devices, compiled kernels.
+
     Nothing is written. Exit status: 0 when a run can start, also with warnings, and 2 when there are errors.
     """
-
-    data: Annotated[Path, tyro.conf.Positional]
-    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
     default_recipe: ClassVar[str] = "2dgs"
 
     recipe: Annotated[Recipe, chosen_recipe]
     """Recipe that the data set is checked for. Default: recipe:2dgs."""
+
+    data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DATA]")] = None
+    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
     json: bool = False
     """Print JSON instead of tables."""
@@ -78,6 +81,10 @@ class Doctor:
     (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:
+        if self.data is None:
+            known = ("--json", "--no-json", f"recipe:{self.default_recipe}")  # the last one is added to all words
+            if words := [word for word in ARGV.get() if not word.startswith(known)]:
+                raise BadInput(f"{words[0]} is about a data set; name its folder: surfkit doctor DATA")
         object.__setattr__(self, "recipe", settled(self.recipe))
         if not 0 <= self.probe <= MOST_PROBED:
             raise BadInput(f"--probe {self.probe}: give 0 (no estimate) to {MOST_PROBED} steps")
@@ -86,6 +93,13 @@ class Doctor:
 
     def run(self) -> int:
         """Check, and print the findings."""
+        if self.data is None:
+            found = machine()
+            if self.json:
+                print(json.dumps(dump(found), indent=2, ensure_ascii=False))
+            else:
+                print_table(("machine", ""), machine_rows(found))
+            return 0
         data = self.reading.of(self.data, self.recipe.test_every)
         if self.steps is None:
             recipe = with_usual_steps(self.recipe, data, self.device)
@@ -181,6 +195,30 @@ def _gpu_rows(found: Estimate) -> list[tuple[str, str]]:
         return []
     text = f"{size(gpu.memory_bytes)}, of which photographs {size(gpu.cache_bytes)}; {size(gpu.free_bytes)} are free"
     return [("GPU memory", text)]
+
+
+def machine_rows(found: Machine) -> list[tuple[str, str]]:
+    """The rows of the table of a machine."""
+    kernels = found.native
+    runnable = f"{', '.join(kernels.kernels)} run here, {kernels.in_use} is used ({kernels.file}, {kernels.compiler})"
+    return [
+        ("surfkit", found.surfkit),
+        ("Python", found.python),
+        ("system", found.system),
+        (
+            "processors",
+            f"{found.processors}, of which torch uses {found.threads}; {size(found.memory_bytes)} of memory",
+        ),
+        ("CUDA of torch", found.cuda or "none: a build without"),
+        *(
+            (f"GPU {i}", f"{each.name}, {size(each.memory_bytes)}, {each.capability}")
+            for i, each in enumerate(found.gpus)
+        ),
+        ("compiled kernels", kernels.lacking or runnable),
+        *((f"rasterizer {name}", text) for name, text in found.rasterizers.items()),
+        ("packages", ", ".join(f"{name} {version}" for name, version in found.packages.items())),
+        ("plugins", ", ".join(found.plugins) or "none"),
+    ]
 
 
 def verdict(diagnosis: Diagnosis, estimate_wanted: bool) -> str:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.native import module
+from surfkit.native import lacking, module
 from surfkit.scene.camera import Camera
 
 ENOUGH = 2000
@@ -163,10 +163,7 @@ def improve(
 def require_native() -> None:
     """BadInput where surfkit was installed without its compiled part."""
     if module() is None:
-        raise BadInput(
-            "patch-match needs the compiled part of surfkit, and no C++ compiler was found when it was installed: "
-            "install GCC or Clang and then surfkit again, or use plane-sweep in its place"
-        )
+        raise BadInput(f"patch-match needs the compiled kernels: {lacking()}, or use plane-sweep in its place")
 
 
 def pattern(window: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.mesh.cubes import EDGES, triangles
 from surfkit.mesh.lattice import MOST, REACH, Corner, HostGrid, Lattice, Picture, Pieces
 from surfkit.mesh.reference import ReferenceGrid
-from surfkit.native import module
+from surfkit.native import lacking, module
 
 
 class NativeGrid(HostGrid):
@@ -55,10 +55,5 @@ def grid(lattice: Lattice) -> HostGrid:
     """An empty grid, compiled if surfkit is."""
     if module() is not None:
         return NativeGrid(lattice)
-    emit(
-        Warned(
-            "surfkit was installed without its compiled part (no C++ compiler was found): meshes are made in numpy "
-            "instead, about a hundred times slower; install GCC or Clang, then surfkit again"
-        )
-    )
+    emit(Warned(f"{lacking()}: meshes are made in numpy instead, about a hundred times slower"))
     return ReferenceGrid(lattice)

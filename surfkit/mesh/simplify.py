@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
-from surfkit.native import module
+from surfkit.native import lacking, module
 
 SPARE = 6.0
 """What a collapse may cost, in squares of the length that is allowed: then 99 of 100 places stay within it."""
@@ -19,7 +19,7 @@ SPARE = 6.0
 def require_kernels(what: str) -> None:
     """BadInput where surfkit was installed without the compiled kernels, which simplify meshes."""
     if module() is None:
-        raise BadInput(f"{what} needs the compiled kernels: install surfkit again where there is a C++ compiler")
+        raise BadInput(f"{what} needs the compiled kernels: {lacking()}")
 
 
 def simplified(mesh: Mesh, most: int | None = None, error: float | None = None) -> Mesh:

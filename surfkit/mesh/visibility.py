@@ -34,7 +34,7 @@ from surfkit.mesh.sights import Seeing, Sights, boxes_of, for_all, seen
 from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.support import supported
 from surfkit.mesh.trust import Trust
-from surfkit.native import module
+from surfkit.native import lacking, module
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import up_of_views
@@ -190,10 +190,7 @@ class Visibility(Mesher):
     def ready(self) -> None:
         """See `Mesher.ready`."""
         if module() is None:
-            raise BadInput(
-                "mesh:visibility needs the compiled part of surfkit, and no C++ compiler was found when it was "
-                "installed; install GCC or Clang, then surfkit again, or use mesh:tsdf"
-            )
+            raise BadInput(f"mesh:visibility needs the compiled kernels: {lacking()}, or use mesh:tsdf")
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""

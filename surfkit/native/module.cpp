@@ -30,6 +30,11 @@ void keep_freed_memory() {
 }  // namespace surfkit
 
 NB_MODULE(_native, m) {
+#if defined(__clang__)
+    m.attr("compiler") = __VERSION__;  // begins with its name
+#else
+    m.attr("compiler") = "GCC " __VERSION__;
+#endif
     surfkit::keep_freed_memory();
     surfkit::add_raster(m);
     surfkit::add_mesh(m);

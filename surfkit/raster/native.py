@@ -24,12 +24,7 @@ class NativeRasterizer(Rasterizer):
 
     def missing(self) -> str | None:
         """See `Rasterizer.missing`."""
-        if native.module() is not None:
-            return None
-        return (
-            "surfkit was installed without its compiled rasterizer (no C++ compiler was found); install GCC or Clang, "
-            "then surfkit again"
-        )
+        return native.lacking() if native.module() is None else None
 
     def title(self) -> str:
         """See `Rasterizer.title`."""

@@ -22,7 +22,7 @@ from surfkit.raster.select import select, torch_device
 def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkeypatch):
     monkeypatch.setattr(native, "module", lambda: None)
     monkeypatch.setattr("surfkit.raster.select.warnings", warnings)  # not the skip of conftest.py
-    with pytest.warns(UserWarning, match="without its compiled rasterizer") as warned:
+    with pytest.warns(UserWarning, match="without its compiled kernels") as warned:
         rasterizer, name = select()
     assert isinstance(rasterizer, Reference) and name.startswith("cpu reference")
     assert len(warned) == 1
