@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
-    "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "laspy": "maps", "lazrs": "maps",
+    "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "kornia": "features", "laspy": "maps", "lazrs": "maps",
     "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps", "pyproj": "crs", "rasterio": "maps",
     "ray": "ray", "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "trimesh": "mesh",
     "viser": "view",
