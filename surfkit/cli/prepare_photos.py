@@ -65,13 +65,13 @@ class Photos:
     makes those that its recipe uses."""
 
     device: Device = "auto"
-    """Device for depth maps, and for features and matchers in torch: auto, cpu, cuda, cuda:1, or that of a rasterizer, by its name (`surfkit components
-    rasterizer`)."""
+    """Device for depth maps, and for features and matchers in torch: auto, cpu, cuda, cuda:1, or that of a rasterizer,
+    by its name (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:
         if self.depth is None and self.device != "auto" and not self.settings.in_torch:
             raise BadInput(
-                f"--device {self.device} is for depth maps, and for features and matchers in torch, and there are none; "
+                f"--device {self.device} is for depth maps and for features and matchers in torch, and there are none; "
                 "add depth:patch-match or features:kornia-sift"
             )
 

@@ -107,5 +107,5 @@ class FeatureMatcher(Component):
         return None
 
     def refuse_missing(self, descriptors: str) -> None:
-        """BadInput if what it needs for these descriptors is not on this machine; asked before anything else is done."""
+        """BadInput if what it needs for these descriptors is not on this machine; asked before all other work."""
         return None

@@ -18,8 +18,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, write_json
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
-from surfkit.sfm.engine import load_engine, run
 from surfkit.sfm.base import Features, MatchInput
+from surfkit.sfm.engine import load_engine, run
 from surfkit.sfm.features import feature_file, read_features, reduced, scaled
 from surfkit.sfm.pairs import Pair
 from surfkit.sfm.photographs import Photo, lens_groups
@@ -237,13 +237,18 @@ def _write_photos(
         frame = engine.Frame(rig_id=rig_number)
         frame.add_data_id(engine.data_t(engine.sensor_t(camera_type, camera), image))
         opened.write_frame(frame)
-        found: Features = read_features(feature_file(features, photo, settings))
-        opened.write_keypoints(image, found.keypoints)
-        if settings.features.descriptors == "sift":  # pycolmap compares no others
-            sift = engine.FeatureExtractorType.SIFT
-            opened.write_descriptors(image, engine.FeatureDescriptors(sift, found.descriptors))
+        found = read_features(feature_file(features, photo, settings))
+        write_features(engine, opened, image, found, settings.features.descriptors)
         numbers[photo.name] = image
     return numbers
+
+
+def write_features(engine: Any, opened: Any, image: int, found: Features, kind: str) -> None:
+    """Write the features of a photograph into an open database; descriptors only if pycolmap can compare them."""
+    opened.write_keypoints(image, found.keypoints)
+    if kind == "sift":
+        descriptors = engine.FeatureDescriptors(engine.FeatureExtractorType.SIFT, found.descriptors)
+        opened.write_descriptors(image, descriptors)
 
 
 def _camera(engine: Any, photo: Photo, model: str) -> Any:

@@ -32,9 +32,8 @@ class SIFT(FeatureExtractor):
 
     def at_once(self, pixels: int) -> int:
         """See `FeatureExtractor.at_once`."""
-        return (
-            1 if load_engine().has_cuda else max(1, min(os.cpu_count() or 1, MOST_BYTES // (BYTES_PER_PIXEL * pixels)))
-        )
+        threads = min(os.cpu_count() or 1, MOST_BYTES // (BYTES_PER_PIXEL * pixels))
+        return 1 if load_engine().has_cuda else max(1, threads)
 
     def opened(self, most: int, device: torch.device) -> Find:
         """See `FeatureExtractor.opened`."""
@@ -57,8 +56,8 @@ class SIFT(FeatureExtractor):
 
 @dataclass(frozen=True)
 class PyCOLMAP(FeatureMatcher):
-    """Mutual nearest neighbours by pycolmap, nearer than the next by a ratio of 0.8: for SIFT alone, on the CPU; on a GPU
-    if pycolmap was built with CUDA."""
+    """Mutual nearest neighbours by pycolmap, nearer than the next by a ratio of 0.8: for SIFT alone, on the CPU; on a
+    GPU if pycolmap was built with CUDA."""
 
     in_torch: ClassVar[bool] = False
 

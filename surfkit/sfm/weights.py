@@ -54,8 +54,8 @@ def network_of(
         except Exception as error:  # of urllib, http, torch, or of kornia itself
             said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
             raise BadInput(
-                f"{what}: its weights cannot be downloaded: get {source} on a machine with a network, and give the file "
-                f"with {option} FILE ({said})"
+                f"{what}: its weights cannot be downloaded: get {source} on a machine with a network, and give "
+                f"the file with {option} FILE ({said})"
             ) from error
     network = build()
     state = _renamed(_read(what, option, weights))

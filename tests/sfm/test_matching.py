@@ -15,7 +15,7 @@ from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
 from surfkit.sfm.similarity import umeyama
 
-from .flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly
+from .flight import HEIGHT, NOISE_PX, WIDTH, fly
 
 CPU = torch.device("cpu")
 

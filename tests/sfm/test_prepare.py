@@ -529,7 +529,7 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
         (("depth:depth-anything-v2", "--depth.weights", "nowhere"), "depth-anything-v2 needs|nowhere cannot be loaded"),
         (
             ("--device", "cpu"),
-            "--device cpu is for depth maps, and for features and matchers in torch, and there are none; add depth",
+            "--device cpu is for depth maps and for features and .*; add depth",
         ),
     ],
 )
