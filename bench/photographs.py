@@ -18,10 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.core.registry import find
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import from_utm
+from surfkit.sfm.base import FeatureExtractor, FeatureMatcher
 from surfkit.sfm.prepare import Preparation
 from surfkit.sfm.settings import Settings
 from surfkit.sfm.similarity import umeyama
@@ -57,6 +59,9 @@ def main() -> None:
     parser.add_argument("--pairs", default="auto")
     parser.add_argument("--mapper", default="incremental")
     parser.add_argument("--longest", type=int, default=1600)
+    parser.add_argument("--max-features", type=int, default=8192)
+    parser.add_argument("--features", default="sift", help="name of a part, with its default settings")
+    parser.add_argument("--matcher", default="pycolmap", help="likewise")
     parser.add_argument("--work", type=Path, help="folder to keep, which later calls go on from")
     given = parser.parse_args()
     known = {name: centre + PLACE for name, centre in centres(given.data).items()}
@@ -70,7 +75,14 @@ def main() -> None:
             if given.noise is not None:
                 write_positions(photos, known, given.noise, given.far, given.seed)
         began, cpu = time.perf_counter(), time.process_time()
-        settings = Settings(pairs=given.pairs, mapper=given.mapper, longest=given.longest)
+        settings = Settings(
+            longest=given.longest,
+            max_features=given.max_features,
+            features=find(FeatureExtractor, given.features)(),
+            matcher=find(FeatureMatcher, given.matcher)(),
+            pairs=given.pairs,
+            mapper=given.mapper,
+        )
         with collect_notes():
             report = Preparation(photos, work / "scene", settings).run()
         spent = time.perf_counter() - began, time.process_time() - cpu

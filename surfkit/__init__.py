@@ -54,6 +54,7 @@ _HOME = {
     "surfkit.primitives.points": ("Columns", "Points"),
     "surfkit.raster.autograd": ("AutogradRender", "DerivedRender"),
     "surfkit.losses.base": ("Loss", "Neighbour", "Regularizer", "RegularizerInput", "Target"),
+    "surfkit.sfm.base": ("FeatureExtractor", "FeatureMatcher", "Features", "Find", "MatchInput"),
     "surfkit.depth.base": ("DepthEstimator", "DepthInput", "Estimate"),
     "surfkit.appearance.base": ("Appearance",),
     "surfkit.start.base": ("InitialModel", "Start", "StartInput"),

@@ -23,6 +23,8 @@ SLOTS = {
     "mesh": "mesher",
     "depth": "depth-estimator",
     "estimator": "depth-estimator",
+    "features": "feature-extractor",
+    "matcher": "feature-matcher",
     "losses": "loss",
     "filters": "filter",
     "regularizers": "regularizer",

@@ -65,12 +65,15 @@ class Photos:
     makes those that its recipe uses."""
 
     device: Device = "auto"
-    """Device for depth maps: auto, cpu, cuda, cuda:1, or that of a rasterizer, by its name (`surfkit components
-    rasterizer`)."""
+    """Device for depth maps, and for features and matchers in torch: auto, cpu, cuda, cuda:1, or that of a rasterizer,
+    by its name (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:
-        if self.depth is None and self.device != "auto":
-            raise BadInput(f"--device {self.device} is for depth maps, and none are made; add depth:patch-match")
+        if self.depth is None and self.device != "auto" and not self.settings.in_torch:
+            raise BadInput(
+                f"--device {self.device} is for depth maps and for features and matchers in torch, and there are none; "
+                "add depth:patch-match or features:kornia-sift"
+            )
 
     @property
     def scene(self) -> Path:
@@ -96,11 +99,12 @@ class Photos:
             torch_device(self.device)
             self.depth.refuse_missing()
             refuse_foreign_maps(scene)
+        device = torch_device(self.device) if self.settings.in_torch else torch.device("cpu")
         with collect_notes(), locked(scene / WORK):
             before = maps_before(scene)
             with bars():
                 sweep(scene)
-                report = Preparation(root, scene, self.settings, self._refuse_unfit).run()
+                report = Preparation(root, scene, self.settings, self._refuse_unfit, device).run()
             if self.depth is not None:
                 write_json(scene / REPORT, report | {"depth_maps": {"estimator": self.depth}})  # to go on from
                 report |= self._depth_maps(self.depth)
@@ -134,7 +138,7 @@ def as_before(photos: Path, device: Device) -> Photos:
 
     Args:
         photos: The folder.
-        device: Where depth maps are made, if some are.
+        device: Where depth maps are made and torch finds and compares features, if so.
 
     Raises:
         BadInput: The report of the scene is damaged.
@@ -147,7 +151,7 @@ def as_before(photos: Path, device: Device) -> Photos:
         told = read_json(report, dict[str, Any])
         settings, maps = load(Settings, told["settings"]), maps_before(usual.scene)
         if maps is None:
-            return replace(usual, settings=settings)
+            return replace(usual, settings=settings, device=device if settings.in_torch else "auto")
         return replace(usual, settings=settings, depth=load(DepthEstimator, maps["estimator"]), device=device)
     except (BadInput, KeyError, TypeError) as error:
         raise BadInput(f"{report}: damaged, or of another version; delete it to prepare the scene again") from error

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 
 from surfkit.cli.prepare_photos import refuse_foreign
@@ -13,11 +14,15 @@ from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
+from surfkit.core.registry import choice
+from surfkit.raster.select import Device, torch_device
 from surfkit.readers.data import Data
 from surfkit.readers.read import reader_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.pixels import Alpha
+from surfkit.sfm.base import FeatureExtractor, FeatureMatcher
 from surfkit.sfm.settings import WORK, Settings
+from surfkit.sfm.sift import SIFT, PyCOLMAP
 from surfkit.sfm.tie_points import TiePoints
 from surfkit.train.bars import bars
 
@@ -41,8 +46,17 @@ class Points:
     longest: int = 1600
     """Features are found in photographs reduced to this longer side, pixels."""
 
-    features: int = 8192
+    max_features: int = 8192
     """About how many features are kept of a photograph."""
+
+    features: Annotated[FeatureExtractor, choice(FeatureExtractor)] = SIFT()
+    """How features are found: `features:sift`, or others in torch."""
+
+    matcher: Annotated[FeatureMatcher, choice(FeatureMatcher)] = PyCOLMAP()
+    """How the features of two photographs are compared."""
+
+    device: Device = "auto"
+    """Device for features and matchers in torch: auto, cpu, cuda, cuda:1, or that of a rasterizer, by its name."""
 
     pairs: Literal["poses", "exhaustive"] = "poses"
     """Which photographs are compared: each with those that stand near it and look at the same place, or all with all,
@@ -79,14 +93,21 @@ class Points:
         given = {"layout": self.layout, "images": self.images, "masks": self.masks, "alpha": self.alpha}
         data, scene = Data(self.data, **given), self.scene
         way = "auto" if self.pairs == "poses" else "exhaustive"
-        settings = Settings(self.longest, self.features, way, self.neighbours, seed=self.seed)
+        names = ("longest", "max_features", "features", "matcher", "neighbours", "seed")
+        settings = Settings(pairs=way, **{name: getattr(self, name) for name in names})
+        if self.device != "auto" and not settings.in_torch:
+            raise BadInput(
+                f"--device {self.device} is for features and matchers in torch, and there are none; add "
+                "features:kornia-sift"
+            )
+        device = torch_device(self.device) if settings.in_torch else torch.device("cpu")
         reader_of(data)  # or one line that says what is wrong
         if scene.resolve().is_relative_to(self.data.resolve()):
             raise BadInput(f"--out {scene} lies in the data set {self.data}; name a folder outside")
         refuse_foreign(scene)
         with collect_notes(), bars(), locked(scene / WORK):
             sweep(scene)
-            report = TiePoints(data, scene, settings).run()
+            report = TiePoints(data, scene, settings, device).run()
         show(report, scene)
 
 

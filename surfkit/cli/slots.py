@@ -87,8 +87,10 @@ def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"nothing to choose at {slot!r}; {hint}choices are made at {', '.join(known) or 'no place'}"
     if name not in known[slot]:
-        files = {"recipe": "; or name a file, recipe:FILE.json", "table": "; or name a file, FILE.json or FILE.py"}
-        return unknown(slot, name, known[slot]) + files.get(slot, "")
+        more = {"recipe": "; or name a file, recipe:FILE.json", "table": "; or name a file, FILE.json or FILE.py"}
+        if name.isdecimal():
+            more["features"] = f"; how many are kept is --max-features {name}"
+        return unknown(slot, name, known[slot]) + more.get(slot, "")
     return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
 
 

@@ -11,10 +11,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
-    "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "laspy": "maps", "lazrs": "maps",
-    "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps", "pyproj": "crs", "rasterio": "maps",
-    "ray": "ray", "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "trimesh": "mesh",
-    "viser": "view",
+    "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "kornia": "features", "laspy": "maps",
+    "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps", "pyproj": "crs",
+    "rasterio": "maps", "ray": "ray", "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth",
+    "trimesh": "mesh", "viser": "view",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""
 INSTALLED_AS = {

@@ -27,7 +27,7 @@ from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
 _PARTS = """
-export readers raster primitives losses depth start appearance densify mesh partition compress execute refine lod
+export readers raster sfm primitives losses depth start appearance densify mesh partition compress execute refine lod
 method recipes
 """
 BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS.split())

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.stages import Stages, key_of
@@ -42,6 +43,7 @@ def compare(
     sources: Sources,
     work: Path,
     settings: Settings,
+    device: torch.device,
     cameras: Mapping[str, Any] | None = None,
     poses: Mapping[str, np.ndarray] | None = None,
 ) -> Compared:
@@ -53,11 +55,12 @@ def compare(
         sources: Where photographs and masks are.
         work: Folder of what the stages keep.
         settings: How.
+        device: Where torch works.
         cameras: As for `match`.
         poses: (4, 4) world_to_camera of each photograph, by its name, if they are known.
     """
     folder, database, listed = work / "features", work / "database.db", work / "pairs.json"
-    counts = stages.run("features", "", lambda: find_features(photos, sources, folder, settings))
+    counts = stages.run("features", "", lambda: find_features(photos, sources, folder, settings, device))
     rich = [photo for photo in photos if counts[photo.name] >= FEWEST]
     made_of = contents(rich, folder, settings, cameras)
 
@@ -77,7 +80,7 @@ def compare(
     stages.run(
         "matches",
         key,
-        lambda: match(rich, pairs, folder, database, settings, cameras),
+        lambda: match(rich, pairs, folder, database, settings, device, cameras),
         lambda: refuse_other(database, made_of),
     )
     return Compared(counts, rich, database, key)

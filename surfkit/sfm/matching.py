@@ -6,17 +6,21 @@ A pair is compared once. When photographs or features change, a new database tak
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
+import torch
+
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import dump, read_json, write_json
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
+from surfkit.sfm.base import Features, MatchInput
 from surfkit.sfm.engine import load_engine, run
-from surfkit.sfm.features import Features, feature_file, read_features
+from surfkit.sfm.features import feature_file, read_features, reduced, scaled
 from surfkit.sfm.pairs import Pair
 from surfkit.sfm.photographs import Photo, lens_groups
 from surfkit.sfm.settings import Settings
@@ -26,6 +30,8 @@ BATCH, MOST_BATCHES = 40, 200
 begins by reading what the database says of all photographs."""
 DEFAULT_FOCAL = 1.2
 """Focal length over the longer side, where EXIF says none."""
+KEPT = 64
+"""Photographs whose features are kept in memory: those of the pairs of a batch mostly."""
 EXTRA = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4}
 """Coefficients of distortion; the last three models have two focal lengths."""
 
@@ -43,11 +49,13 @@ class Contents:
         features: Name of the file of features of each photograph, by its name.
         lenses: Model, camera, size and focal length of each photograph, by its name.
         seed: Of the geometric verification.
+        matcher: How features are compared.
     """
 
     features: dict[str, str]
     lenses: dict[str, str]
     seed: int
+    matcher: str
 
 
 def contents(
@@ -58,7 +66,7 @@ def contents(
     lenses = {photo.name: f"{settings.lens} {photo.exif.which} {photo.size} {photo.exif.focal_px}" for photo in photos}
     if cameras is not None:
         lenses = {photo.name: str(cameras[photo.name]) for photo in photos}
-    return Contents(features, lenses, settings.seed)
+    return Contents(features, lenses, settings.seed, f"{dump(settings.matcher)} {settings.matcher.version}")
 
 
 def match(
@@ -67,6 +75,7 @@ def match(
     features: Path,
     database: Path,
     settings: Settings,
+    device: torch.device,
     cameras: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the database, with all pairs compared; pairs that an earlier call has compared are not again.
@@ -77,6 +86,7 @@ def match(
         features: Folder of features.
         database: The file.
         settings: How.
+        device: Where torch works.
         cameras: pycolmap.Camera of each photograph, by its name; None where they are still to be found.
     """
     engine, wanted = load_engine(), contents(photos, features, settings, cameras)
@@ -84,15 +94,17 @@ def match(
         refuse_other(database, wanted)
     except BadInput:
         _begin(photos, pairs, features, database, settings, cameras)
-    file = database.with_name("pairs.txt")
+    named = [(photos[one].name, photos[two].name) for one, two in pairs]
+    todo = _not_compared(database, named)
+    file, done = database.with_name("pairs.txt"), len(pairs) - len(todo)
+    given = _given(photos, features, database, file, settings, device)
     size = max(BATCH, -(-len(pairs) // MOST_BATCHES))
-    for start in range(0, len(pairs), size):
-        batch = pairs[start : start + size]
+    for start in range(0, len(todo), size):
+        batch = todo[start : start + size]
         with replacing(file) as opened:
-            lines = [f"{alias(photos[one].name)} {alias(photos[two].name)}\n" for one, two in batch]
-            opened.write("".join(lines).encode())
-        run("comparing photographs", lambda token: _compare(engine, database, file, settings, token))
-        emit(Progress("comparing photographs", start + len(batch), len(pairs)))
+            opened.write("".join(f"{alias(one)} {alias(two)}\n" for one, two in batch).encode())
+        _compare(engine, replace(given, pairs=batch), settings)
+        emit(Progress("comparing photographs", done + start + len(batch), len(pairs)))
     file.unlink(missing_ok=True)
 
 
@@ -119,14 +131,53 @@ def matched(database: Path) -> dict[str, int]:
     return counts
 
 
-def _compare(engine: Any, database: Path, pairs: Path, settings: Settings, token: Any) -> None:
-    matching = engine.FeatureMatchingOptions()
-    matching.use_gpu = engine.has_cuda
-    pairing = engine.ImportedPairingOptions()
-    pairing.match_list_path = pairs
+def _not_compared(database: Path, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those of the pairs, by name, that the database has no verified matches of."""
+    opened = load_engine().Database.open(database)
+    try:
+        numbers = _numbers(opened)
+        return [(one, two) for one, two in pairs if not opened.exists_two_view_geometry(numbers[one], numbers[two])]
+    finally:
+        opened.close()
+
+
+def _given(
+    photos: Sequence[Photo], features: Path, database: Path, listed: Path, settings: Settings, device: torch.device
+) -> MatchInput:
+    """What the matcher needs, but for the pairs."""
+    by_name = {photo.name: photo for photo in photos}
+    sizes = {photo.name: reduced(photo.size, settings.longest) for photo in photos}
+
+    @lru_cache(KEPT)
+    def load(name: str) -> Features:
+        found = read_features(feature_file(features, by_name[name], settings))
+        return replace(found, keypoints=scaled(found.keypoints, by_name[name].size, sizes[name]))
+
+    return MatchInput((), load, sizes, settings.features.descriptors, device, database, listed)
+
+
+def _compare(engine: Any, given: MatchInput, settings: Settings) -> None:
+    """Write matches of pairs, and which of them one motion of the camera explains."""
+    opened = engine.Database.open(given.database)
+    try:
+        numbers = _numbers(opened)
+        todo = [(one, two) for one, two in given.pairs if not opened.exists_matches(numbers[one], numbers[two])]
+        for (one, two), found in zip(todo, settings.matcher.match(replace(given, pairs=todo)), strict=True):
+            if not opened.exists_matches(numbers[one], numbers[two]):  # pycolmap writes its own
+                opened.write_matches(numbers[one], numbers[two], found)
+    finally:
+        opened.close()
     verification = engine.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed
-    engine.match_image_pairs(database, matching, pairing, verification, engine.Device.auto, token)
+    run(
+        "verifying matches",
+        lambda token: engine.verify_matches(given.database, given.listed, verification, cancellation_token=token),
+    )
+
+
+def _numbers(opened: Any) -> dict[str, int]:
+    """The number of each photograph in a database, by its name."""
+    return {unquote(image.name): image.image_id for image in opened.read_all_images()}
 
 
 def _record(database: Path) -> Path:
@@ -186,12 +237,18 @@ def _write_photos(
         frame = engine.Frame(rig_id=rig_number)
         frame.add_data_id(engine.data_t(engine.sensor_t(camera_type, camera), image))
         opened.write_frame(frame)
-        found: Features = read_features(feature_file(features, photo, settings))
-        opened.write_keypoints(image, found.keypoints)
-        sift = engine.FeatureExtractorType.SIFT
-        opened.write_descriptors(image, engine.FeatureDescriptors(sift, found.descriptors))
+        found = read_features(feature_file(features, photo, settings))
+        write_features(engine, opened, image, found, settings.features.descriptors)
         numbers[photo.name] = image
     return numbers
+
+
+def write_features(engine: Any, opened: Any, image: int, found: Features, kind: str) -> None:
+    """Write the features of a photograph into an open database; descriptors only if pycolmap can compare them."""
+    opened.write_keypoints(image, found.keypoints)
+    if kind == "sift":
+        descriptors = engine.FeatureDescriptors(engine.FeatureExtractorType.SIFT, found.descriptors)
+        opened.write_descriptors(image, descriptors)
 
 
 def _camera(engine: Any, photo: Photo, model: str) -> Any:
@@ -212,7 +269,7 @@ def _take_over(
         before = read_json(_record(database), Contents)
     except BadInput:
         return
-    if not database.is_file() or before.seed != wanted.seed:
+    if not database.is_file() or (before.seed, before.matcher) != (wanted.seed, wanted.matcher):
         return
     same = {
         name
@@ -221,7 +278,7 @@ def _take_over(
     }
     old = load_engine().Database.open(database)
     try:
-        there = {unquote(image.name): image.image_id for image in old.read_all_images()}
+        there = _numbers(old)
         for one, two in pairs:
             if one in same and two in same and old.exists_matches(there[one], there[two]):
                 new.write_matches(numbers[one], numbers[two], old.read_matches(there[one], there[two]))

@@ -53,7 +53,7 @@ def choose_pairs(
     Args:
         photos: With enough features.
         settings: How they are chosen.
-        descriptors: Gives the (K, 128) uint8 descriptors of a photograph by its position.
+        descriptors: Gives the (K, D) uint8 or float16 descriptors of a photograph by its position.
         poses: (N, 4, 4) float64 world_to_camera, if they are known; `auto` goes by them.
     """
     way, count = settings.pairs, len(photos)

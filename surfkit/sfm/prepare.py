@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
@@ -50,12 +51,14 @@ class Preparation:
         scene: The data set.
         settings: How cameras are found.
         refuse: Raises BadInput if the usable photographs do not fit what comes after the cameras.
+        device: Where features are found and compared in torch.
     """
 
     root: Path
     scene: Path
     settings: Settings
     refuse: Callable[[Sequence[Photo]], None] = lambda _: None
+    device: torch.device = torch.device("cpu")
 
     @property
     def work(self) -> Path:
@@ -69,6 +72,7 @@ class Preparation:
             BadInput: There are too few photographs that can be used, or no cameras can be found for them.
         """
         load_engine()
+        self.settings.refuse_missing()
         stages = Stages(self.work)
         sources, photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
@@ -76,7 +80,7 @@ class Preparation:
         self.refuse(usable)
         positions = settle(usable, sources.root, self.settings) if self.settings.gps else Positions(usable)
         usable, site = positions.photos, self._site(positions)
-        found = compare(stages, usable, sources, self.work, self.settings)
+        found = compare(stages, usable, sources, self.work, self.settings, self.device)
         key = key_of(found.key, self.settings.mapper, self.settings.seed)
         models = stages.run("cameras", key, lambda: self._map(found.database, len(found.rich)), self._load_models)
         matches = matched(found.database)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from surfkit.core.check import BadInput, require_within
+from surfkit.core.registry import choice
 from surfkit.scene.pixels import Alpha
+from surfkit.sfm.base import FeatureExtractor, FeatureMatcher
+from surfkit.sfm.sift import SIFT, PyCOLMAP
 
 WORK, REPORT = "prepare", "report.json"
 """Folder of the data set for what the stages keep, and what is told of it at the end."""
@@ -21,8 +24,14 @@ class Settings:
     """Features are found in photographs reduced to this longer side, pixels; 3200 is more exact and takes four times as
     long. The photographs that are written keep their size."""
 
-    features: int = 8192
+    max_features: int = 8192
     """About how many features are kept of a photograph."""
+
+    features: Annotated[FeatureExtractor, choice(FeatureExtractor)] = SIFT()
+    """How features are found: `features:sift`, or others in torch."""
+
+    matcher: Annotated[FeatureMatcher, choice(FeatureMatcher)] = PyCOLMAP()
+    """How the features of two photographs are compared."""
 
     pairs: Literal["auto", "exhaustive", "gps", "sequence", "retrieval"] = "auto"
     """Which photographs are compared: all with all, each with its neighbours by GPS, by time or name, or by likeness
@@ -79,7 +88,12 @@ class Settings:
     fourth band of a TIFF file is no opacity."""
 
     def __post_init__(self) -> None:
-        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "frames": (3, 10_000), "neighbours": (1, 1000)}
+        ranges = {
+            "longest": (100, 20_000),
+            "max_features": (100, 100_000),
+            "frames": (3, 10_000),
+            "neighbours": (1, 1000),
+        }
         require_within({"frame_step": (0.005, 0.5)}, self)
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
         if self.checkpoints and self.gcp is None:
@@ -92,3 +106,14 @@ class Settings:
             raise BadInput("--positions-crs is that of --positions FILE, which is not given")
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")
+        self.matcher.refuse_unfit(self.features)
+
+    @property
+    def in_torch(self) -> bool:
+        """Whether features are found or compared on the device that is given."""
+        return self.features.in_torch or self.matcher.in_torch
+
+    def refuse_missing(self) -> None:
+        """BadInput if packages or weights for features are not on this machine."""
+        self.features.refuse_missing()
+        self.matcher.refuse_missing(self.features.descriptors)

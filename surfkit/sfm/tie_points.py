@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
+import torch
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
@@ -48,11 +49,13 @@ class TiePoints:
         data: The data set, and how it is read; nothing is written there.
         scene: The new one.
         settings: How features are found and compared.
+        device: Where that is done in torch.
     """
 
     data: Data
     scene: Path
     settings: Settings
+    device: torch.device = torch.device("cpu")
 
     @property
     def work(self) -> Path:
@@ -66,6 +69,7 @@ class TiePoints:
             BadInput: The data set cannot be read, or its photographs share too few features.
         """
         load_engine()
+        self.settings.refuse_missing()
         capture = read_capture(self.data, reader_of(self.data))
         if whole := [shot.name for shot in capture.shots if is_panorama(shot.camera)]:
             raise BadInput(
@@ -79,7 +83,7 @@ class TiePoints:
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
-        found = compare(stages, photos, sources, self.work, self.settings, cameras, poses)
+        found = compare(stages, photos, sources, self.work, self.settings, self.device, cameras, poses)
         if poor := [name for name, count in found.counts.items() if count < FEWEST]:
             emit(Warned(f"{len(poor)} of {len(photos)} photographs have hardly any features: {few(poor)} are left out"))
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])

@@ -7,6 +7,7 @@ of the part's kind. A part that breaks it raises AssertionError with a sentence 
 from surfkit.testing.compress import check_compressor, check_encoding
 from surfkit.testing.data_sets import check_depth_layout, check_split
 from surfkit.testing.executors import check_executor
+from surfkit.testing.features import check_feature_extractor, check_feature_matcher
 from surfkit.testing.files import check_format
 from surfkit.testing.levels import check_levels_of_detail
 from surfkit.testing.method import check_method
@@ -35,6 +36,8 @@ __all__ = [
     "check_depth_layout",
     "check_encoding",
     "check_executor",
+    "check_feature_extractor",
+    "check_feature_matcher",
     "check_filter",
     "check_format",
     "check_levels_of_detail",

@@ -24,7 +24,7 @@ from surfkit.recipe import Recipe
 from surfkit.report.ablation import build, offered_tables
 
 KINDS = write.kinds()
-ALONE = {"executor", "format", "split", "reader", "depth-layout", "rasterizer"}
+ALONE = {"executor", "feature-extractor", "feature-matcher", "format", "split", "reader", "depth-layout", "rasterizer"}
 """Kinds that stand in no recipe."""
 
 

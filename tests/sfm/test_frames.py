@@ -25,7 +25,7 @@ ANGLES = [*np.linspace(0, 0.35, 15), *[0.35] * 20, *np.linspace(0.35, 0.7, 15)]
 """Around the scene, then a rest, then on."""
 STILL = range(14, 36)
 BLURRED = (3, 4, 9, 40, 41)
-QUICK = ("--features", "800")
+QUICK = ("--max-features", "800")
 
 
 @cache

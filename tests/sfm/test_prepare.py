@@ -24,7 +24,7 @@ from surfkit.testing.exif import write_exif
 from .pictures import arc, picture, save
 
 ORIGIN = np.array([512_000.0, 5_800_000.0, 90.0])
-QUICK = ("--features", "1500")
+QUICK = ("--max-features", "1500")
 POSES = {f"view {at}.jpg": pose for at, pose in enumerate(arc(6))}
 CENTRES = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in POSES.items()}
 WRONG = "view 3.jpg"
@@ -283,11 +283,11 @@ def test_a_photograph_more_takes_over_the_others(folder, prepared, tmp_path, mon
     save(tmp_path / "photos/late.jpg", picture(arc(7)[6]))
     compared, plain = [], matching._compare
 
-    def compare(engine, database, pairs, settings, token):
-        opened = engine.Database.open(database)
+    def compare(engine, given, settings):
+        opened = engine.Database.open(given.database)
         before = opened.num_matched_image_pairs()
         opened.close()
-        plain(engine, database, pairs, settings, token)
+        plain(engine, given, settings)
         compared.append(before)
 
     monkeypatch.setattr(matching, "_compare", compare)
@@ -527,7 +527,10 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
     [
         (("depth:plane-sweep", "--depth.window", "25", "--depth.longest", "32"), "window is 25, and the largest"),
         (("depth:depth-anything-v2", "--depth.weights", "nowhere"), "depth-anything-v2 needs|nowhere cannot be loaded"),
-        (("--device", "cpu"), "--device cpu is for depth maps, and none are made; add depth:patch-match"),
+        (
+            ("--device", "cpu"),
+            "--device cpu is for depth maps and for features and .*; add depth",
+        ),
     ],
 )
 def test_depth_that_cannot_be_made_is_refused_before_the_work(folder, tmp_path, monkeypatch, capsys, words, said):

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from needs import needs
 from PIL import Image
 
@@ -23,7 +24,8 @@ from surfkit.sfm.sources import look_at_all
 
 from .pictures import HEIGHT, WIDTH, arc, picture, save
 
-QUICK = ("--features", "800")
+CPU = torch.device("cpu")
+QUICK = ("--max-features", "800")
 HIDDEN = (slice(40, 130), slice(60, 150))
 """Rows and columns that masks hide."""
 
@@ -42,16 +44,18 @@ def folder(tmp_path):
 
 
 def sources_of(folder, **settings):
-    return look_at_all(folder / "p", folder / "work", folder / "photographs.json", Settings(features=800, **settings))
+    return look_at_all(
+        folder / "p", folder / "work", folder / "photographs.json", Settings(max_features=800, **settings)
+    )
 
 
 def test_no_feature_is_taken_where_a_mask_is_black(folder):
-    settings = Settings(features=800, masks=folder / "m")
+    settings = Settings(max_features=800, masks=folder / "m")
     sources, photos = sources_of(folder, masks=folder / "m")
     assert [bool(photo.mask) for photo in photos] == [True, True, True, True, False]
-    counts = find_features(photos, sources, folder / "f", settings)
+    counts = find_features(photos, sources, folder / "f", settings, CPU)
     whole, plain = sources_of(folder)
-    before = find_features(plain, whole, folder / "f", Settings(features=800))
+    before = find_features(plain, whole, folder / "f", Settings(max_features=800), CPU)
     for photo, unmasked in zip(photos, plain, strict=True):
         spots = read_features(feature_file(folder / "f", photo, settings)).keypoints[:, :2]
         inside = (spots >= (60, 40)).all(1) & (spots < (150, 130)).all(1)
@@ -65,13 +69,13 @@ def test_a_set_of_cut_outs_is_read_alike_and_masks_that_keep_nothing_are_told(fo
     alpha[HIDDEN] = 0
     for name, opacity in {"flight/0.jpg": alpha, "flight/1": np.full_like(alpha, 255), "2_mask": alpha * 0}.items():
         Image.fromarray(np.dstack([np.zeros((HEIGHT, WIDTH, 3), np.uint8), opacity])).save(folder / f"m/{name}.png")
-    settings = Settings(features=800, masks=folder / "m")
+    settings = Settings(max_features=800, masks=folder / "m")
     sources, photos = sources_of(folder, masks=folder / "m")
     shares = [sources.read_mask(photo.name, (WIDTH, HEIGHT)).mean() for photo in photos[:4]]
     hidden = 90 * 90 / (WIDTH * HEIGHT)
     assert shares == pytest.approx([1 - hidden, 1, 0, 1 - hidden]), "the last one by its colours"
     with collect_notes() as notes:
-        counts = find_features(photos, sources, folder / "f", settings)
+        counts = find_features(photos, sources, folder / "f", settings, CPU)
     assert counts["flight/1.jpg"] > counts["flight/0.jpg"] > 50 and counts["flight/2.jpg"] == 0
     told = "no features are where the masks of 1 photographs keep something, 'flight/2.jpg'; correct or delete masks"
     assert notes.texts == [f"{told} that keep nothing"]
@@ -111,10 +115,10 @@ def test_what_is_transparent_is_masked_where_alpha_says_so(folder):
         rgb = np.asarray(Image.open(path))
         Image.fromarray(np.dstack([rgb, alpha])).save(path.with_suffix(".png"))
         path.unlink()
-    settings = Settings(features=800, alpha="mask")
+    settings = Settings(max_features=800, alpha="mask")
     sources, photos = sources_of(folder, alpha="mask")
     assert [bool(photo.mask) for photo in photos] == [True, True, True, False, False]
-    counts = find_features(photos[:1], sources, folder / "f", settings)
+    counts = find_features(photos[:1], sources, folder / "f", settings, CPU)
     spots = read_features(feature_file(folder / "f", photos[0], settings)).keypoints[:, :2]
     assert counts[photos[0].name] > 50 and not ((spots >= (60, 40)).all(1) & (spots < (150, 130)).all(1)).any()
     with collect_notes() as notes:

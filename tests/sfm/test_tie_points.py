@@ -17,7 +17,7 @@ from .pictures import FOCAL, HEIGHT, WIDTH, arc, picture, save
 
 POSES = {f"view {at}.jpg": pose for at, pose in enumerate(arc(5))}
 OFFSET = np.array([512_000.0, 5_800_000.0, 90.0])
-QUICK = ("--features", "1500")
+QUICK = ("--max-features", "1500")
 UTM33 = (
     'PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84",DATUM["WGS 84",SPHEROID["WGS 84",6378137,298.257223563]]],'
     'UNIT["metre",1],AUTHORITY["EPSG","32633"]]'

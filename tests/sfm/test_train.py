@@ -63,11 +63,11 @@ def test_cameras_are_found_first_and_the_same_command_goes_on(photos, monkeypatc
 
 @needs_native
 def test_a_scene_prepared_otherwise_stays_as_it_is(photos, monkeypatch):
-    assert main(["prepare", "photos", str(photos), "--features", "1500", "--lens", "RADIAL", "--no-gps"]) == 0
+    assert main(["prepare", "photos", str(photos), "--max-features", "1500", "--lens", "RADIAL", "--no-gps"]) == 0
     seen = calls(monkeypatch)
     assert train(photos, "--prepare") == 0 and seen == []
     report = json.loads((photos.parent / "flight-scene/report.json").read_text())
-    assert (report["settings"]["features"], report["settings"]["lens"]) == (1500, "RADIAL")
+    assert (report["settings"]["max_features"], report["settings"]["lens"]) == (1500, "RADIAL")
 
 
 @needs_native
@@ -75,7 +75,7 @@ def test_depth_maps_of_the_scene_are_taken_and_not_made_again(photos, monkeypatc
     """They are also brought up to date, as the rest of the scene."""
     monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "cache"))
     words = ("depth:plane-sweep", "--depth.longest", "48", "--device", "cpu")
-    assert main(["prepare", "photos", str(photos), "--features", "1500", *words]) == 0
+    assert main(["prepare", "photos", str(photos), "--max-features", "1500", *words]) == 0
     folder = photos.parent / "flight-scene/estimated_depths"
     before = {path.name: path.stat().st_mtime_ns for path in folder.rglob("*.npy")}
     assert len(before) == 2 * 5, "a surface is made of all photographs"

@@ -36,6 +36,9 @@ ELSEWHERE = {
     "method:import": "tests/method/test_imported.py has a file for it",
     "start:splats": "tests/start/test_splats.py has a file for it",
     "method:stereo": "tests/method/test_method.py makes the depth maps for it",
+    "feature-extractor:disk": "tests/sfm/test_learnt.py has weights for it",
+    "feature-extractor:aliked": "tests/sfm/test_learnt.py has weights for it",
+    "feature-matcher:lightglue": "tests/sfm/test_learnt.py has weights for it",
     "depth-estimator:depth-anything-v2": "tests/depth/test_depth_anything.py has weights for it",
 }
 
