@@ -16,6 +16,7 @@ constexpr double kThin = 0.02;       // least height of a triangle over its long
 constexpr double kHold = 1e-4;       // pull to the middle of the edge, where the planes leave a direction open
 constexpr double kGrow = 1e-6;       // share by which the area around an edge may grow, where all is flat
 constexpr double kFar = 1.0;         // a vertex moves no farther than this from the middle, in lengths of the edge
+constexpr size_t kShare = 16;        // of the edges, the cheapest are in the heap, which then fits into the cache
 
 struct Point {
     double x, y, z;
@@ -64,9 +65,9 @@ struct Edge {
     uint32_t stamp;  // changes of both ends when it was looked at
 };
 // The cheapest on top; ties by number, so that the result is one.
-inline bool later(const Edge& a, const Edge& b) {
+constexpr auto later = [](const Edge& a, const Edge& b) {
     return a.cost != b.cost ? a.cost > b.cost : a.u != b.u ? a.u > b.u : a.v > b.v;
-}
+};
 
 struct Neighbour {
     int32_t vertex;
@@ -99,15 +100,15 @@ public:
 
 private:
     void collapse_all() {
-        heap_.clear();
+        heap_.clear(), dear_.clear();
+        sorted_to_ = -1;
         for (int32_t u = 0; u < job_.vertex_count; u++) {
             neighbours(u, around_);
             for (const Neighbour& n : around_)
                 if (n.vertex > u) look_at(u, n.vertex);
         }
-        std::make_heap(heap_.begin(), heap_.end(), later);
-        live_ = std::max<size_t>(heap_.size(), 1024);
-        while (left_ > job_.least && !heap_.empty()) {
+        forget_old();
+        while (left_ > job_.least && (!heap_.empty() || fill_heap())) {
             std::pop_heap(heap_.begin(), heap_.end(), later);
             const Edge edge = heap_.back();
             heap_.pop_back();
@@ -213,7 +214,14 @@ private:
     void look_at(int32_t u, int32_t v) {
         if (job_.fixed[u] && job_.fixed[v]) return;
         const double cost = best(u, v).second;
-        if (cost <= job_.limit) heap_.push_back({(float)cost, std::min(u, v), std::max(u, v), changes_[u] + changes_[v]});
+        if (!(cost <= job_.limit)) return;
+        const Edge edge{(float)cost, std::min(u, v), std::max(u, v), changes_[u] + changes_[v]};
+        if (edge.cost > sorted_to_) {
+            dear_.push_back(edge);
+        } else {
+            heap_.push_back(edge);
+            std::push_heap(heap_.begin(), heap_.end(), later);
+        }
     }
 
     // Whether the surface stays what it is: the edge has one or two triangles, and nothing else connects its ends.
@@ -303,24 +311,34 @@ private:
         places_[3 * (int64_t)u] = (float)p.x, places_[3 * (int64_t)u + 1] = (float)p.y, places_[3 * (int64_t)u + 2] = (float)p.z;
         changes_[u]++, changes_[v]++;
         neighbours(u, around_);
-        for (const Neighbour& n : around_) {
-            const size_t before = heap_.size();
-            look_at(u, n.vertex);
-            if (heap_.size() > before) std::push_heap(heap_.begin(), heap_.end(), later);
-        }
-        if (heap_.size() > 2 * live_) forget_old();
+        for (const Neighbour& n : around_) look_at(u, n.vertex);
+        if (dear_.size() > 2 * live_) forget_old();
     }
 
     // Take out the edges that have changed since: memory stays bounded.
     void forget_old() {
-        heap_.erase(std::remove_if(heap_.begin(), heap_.end(), [&](const Edge& e) { return !is_now(e); }), heap_.end());
+        dear_.erase(std::remove_if(dear_.begin(), dear_.end(), [&](const Edge& e) { return !is_now(e); }), dear_.end());
+        live_ = std::max<size_t>(dear_.size(), 1024);
+    }
+
+    // The heap is empty: take the cheapest of the other edges. False if there are none. Most of them change before it is
+    // their turn, and so are never sorted.
+    bool fill_heap() {
+        forget_old();
+        if (dear_.empty()) return false;
+        const auto last = dear_.end() - 1 - (dear_.size() - 1) / kShare;
+        std::nth_element(dear_.begin(), last, dear_.end(), later);
+        sorted_to_ = last->cost;
+        const auto cheap = std::partition(dear_.begin(), last, [&](const Edge& e) { return e.cost > sorted_to_; });
+        heap_.assign(cheap, dear_.end());
+        dear_.erase(cheap, dear_.end());
         std::make_heap(heap_.begin(), heap_.end(), later);
-        live_ = std::max<size_t>(heap_.size(), 1024);
+        return true;
     }
 
     Collapsed result() {
         Collapsed made;
-        heap_ = {}, next_ = {}, quadrics_ = {}, changes_ = {};
+        heap_ = {}, dear_ = {}, next_ = {}, quadrics_ = {}, changes_ = {};
         made.faces.reserve(3 * left_);
         std::vector<int32_t> number(job_.vertex_count, -1);
         for (const int32_t v : faces_) {
@@ -350,10 +368,11 @@ private:
     std::vector<int32_t> faces_, next_, head_, parent_;
     std::vector<uint32_t> changes_;
     std::vector<Quadric<float>> quadrics_;
-    std::vector<Edge> heap_;
+    std::vector<Edge> heap_, dear_;  // edges that cost no more than sorted_to_, and the others
     std::vector<Neighbour> around_, beyond_;
     int64_t left_;
     size_t live_ = 0;
+    float sorted_to_ = -1;
     bool thin_too_ = false;
 };
 
