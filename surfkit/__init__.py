@@ -6,9 +6,11 @@ The names below are the public surface. Each is imported when it is first used, 
 from __future__ import annotations
 
 import importlib
+from types import ModuleType
 from typing import Any
 
 _HOME = {
+    "surfkit.api": ("Dataset", "Figures", "TrainedRun", "get_recipe", "open_run", "read"),
     "surfkit.core.check": ("BadInput", "Fault", "expect", "leaving_out", "reject"),
     "surfkit.core.codec": ("dump", "load", "read_json", "write_json"),
     "surfkit.core.registry": ("Component", "choice", "components", "find", "hookimpl"),
@@ -85,12 +87,24 @@ _HOME = {
     "surfkit.recipe": ("Recipe",),
     "surfkit.report.ablation": ("Row", "Table"),
 }
+_OTHER_NAMES = {"open": "open_run"}
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
-__all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604
+__all__ = ["__version__", "train", *_OTHER_NAMES, *_MODULE_OF]  # noqa: PLE0604
+
+
+class Callable(ModuleType):
+    """The folder `surfkit.train`, which is the function `surfkit.api.train` too."""
+
+    def __call__(self, *words: Any, **settings: Any) -> Any:
+        """See `surfkit.api.train`."""
+        return importlib.import_module("surfkit.api").train(*words, **settings)
 
 
 def __getattr__(name: str) -> Any:
+    if name == "train":
+        return importlib.import_module("surfkit.train")
+    name = _OTHER_NAMES.get(name, name)
     if name == "__version__":
         from surfkit.core.version import own_version
 

@@ -1,0 +1,79 @@
+"""surfkit in Python: read a data set, train, draw, mesh, measure, export. What the commands do, as functions.
+
+Arrays are numpy's or torch's, with the shapes that are stated; positions are in the frame of the input, as in files.
+Wrong data and settings raise `surfkit.BadInput`, whose text is one line.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from surfkit import pipeline
+from surfkit.api.dataset import Dataset, read
+from surfkit.api.listen import OnStep, listening
+from surfkit.api.results import Figures, Mesh
+from surfkit.api.run import TrainedRun, open_run
+from surfkit.blocks.schedule import Compute
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.registry import offered_once, unknown
+from surfkit.raster.select import Device, torch_device
+from surfkit.recipe import Recipe, complete
+from surfkit.train.material import CacheSettings
+from surfkit.train.stage import Stage
+
+__all__ = ["Dataset", "Figures", "Mesh", "OnStep", "TrainedRun", "get_recipe", "open_run", "read", "train"]
+
+
+def get_recipe(name: str | Path | Recipe) -> Recipe:
+    """A recipe by its name ("surface"), of a JSON file, or the one that is given.
+
+    `surfkit.evolve(recipe, "pretrain.densify", None)` gives one with another value.
+
+    Raises:
+        BadInput: There is none of this name.
+    """
+    if isinstance(name, Recipe):
+        return name
+    text = str(name).removeprefix("recipe:")
+    if text.endswith(".json"):
+        return read_json(Path(text), Recipe)
+    known = offered_once("surfkit_recipes", "a recipe")
+    if text not in known:
+        raise BadInput(unknown("recipe", text, known))
+    return complete(known[text])
+
+
+def train(
+    recipe: str | Path | Recipe,
+    scene: Dataset | str | Path,
+    out: str | Path,
+    *,
+    steps: int | None = None,
+    device: Device = "auto",
+    on_step: OnStep | None = None,
+    cache: str = "auto",
+) -> TrainedRun:
+    """Train, and make the mesh if the recipe has one; a run that was interrupted goes on where it stopped.
+
+    Args:
+        recipe: Its name, its file, or itself.
+        scene: The data set.
+        out: Run folder.
+        steps: Optimisation steps; schedules are scaled along. By default as `surfkit train` has it.
+        device: For training and drawing: "auto", "cpu", "cuda", "cuda:1", or a rasterizer by its name.
+        on_step: Called after each step.
+        cache: Memory for photographs, such as "4GB".
+
+    Raises:
+        BadInput: Wrong settings or data, or `out` holds another run.
+        Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
+    """
+    chosen = get_recipe(recipe)
+    given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
+    if steps is None and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
+        steps = chosen.start.usual_steps(len(given.train), torch_device(device).type == "cuda")
+    chosen = chosen if steps is None else pipeline.with_steps(chosen, steps)
+    with listening(on_step):
+        pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache))
+    return open_run(out, device=device)

@@ -1,0 +1,95 @@
+"""What comes of a run: triangles and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.mesh.base import VALUES
+from surfkit.mesh.base import Mesh as LocalMesh
+from surfkit.mesh.files import write_mesh
+from surfkit.scene.scene import Frame
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the frame of the input.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3) int32, counter-clockwise from outside.
+        colors: (V, 3) uint8, or None.
+        values: Of the vertices, by name: (V,) float32.
+        path: The file that it was read from.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+    path: Path | None = None
+
+    @staticmethod
+    def read(path: Path) -> Mesh:
+        """The mesh in a file."""
+        found = read_surface(path)
+        names = found.rows.dtype.names or ()
+        colors = [found.rows[name] for name in ("red", "green", "blue") if name in names]
+        values = {name: np.asarray(found.rows[name]) for name in VALUES if name in names}
+        return Mesh(found.vertices(), found.faces, np.stack(colors, 1) if colors else None, values, path)
+
+    def save(self, path: str | Path) -> Path:
+        """Write it as .ply, .obj or .glb."""
+        frame = Frame.of_positions(self.vertices)
+        local = LocalMesh(frame.to_local(self.vertices).astype(np.float32), self.faces, self.colors, dict(self.values))
+        return write_mesh(Path(path), local, frame)[0]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What was measured.
+
+    Attributes:
+        metrics: As metrics.json has it.
+    """
+
+    metrics: Mapping[str, Any]
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the held-out photographs, dB."""
+        return self._of("images", "psnr")
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the held-out photographs."""
+        return self._of("images", "ssim")
+
+    @property
+    def precision(self) -> float:
+        """Share of the mesh that lies within tau of the truth."""
+        return self._of("geometry", "precision")
+
+    @property
+    def recall(self) -> float:
+        """Share of the truth that lies within tau of the mesh."""
+        return self._of("geometry", "recall")
+
+    @property
+    def f1(self) -> float:
+        """Harmonic mean of precision and recall."""
+        return self._of("geometry", "f1")
+
+    def _of(self, *names: str) -> float:
+        found: Any = self.metrics
+        for name in names:
+            found = found.get(name) if isinstance(found, Mapping) else None
+        if found is None:
+            raise BadInput(f"{names[-1]} was not measured; evaluate() measures photographs, evaluate(gt=FILE) the mesh")
+        return float(found["mean"] if isinstance(found, Mapping) else found)

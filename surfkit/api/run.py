@@ -1,0 +1,226 @@
+"""A finished run in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surfkit import pipeline
+from surfkit.api.dataset import Dataset
+from surfkit.api.results import Figures, Mesh
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.lock import locked
+from surfkit.core.registry import components, find, unknown
+from surfkit.core.tree import evolve
+from surfkit.evaluate.geometry.comparison import Comparison
+from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.export.base import Format
+from surfkit.export.table import SplatTable
+from surfkit.mesh.base import Mesher
+from surfkit.mesh.tsdf import TSDF
+from surfkit.method.base import Reconstruction
+from surfkit.raster.api import Maps
+from surfkit.raster.select import Device
+from surfkit.recipe import Recipe
+from surfkit.run.context import RunContext
+from surfkit.run.folder import Run, note_metrics
+from surfkit.run.lod import load_levels
+from surfkit.run.measure import evaluate
+from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.run.method import refuse_not_drawn, splats_of
+from surfkit.run.notes import collect_notes
+from surfkit.run.prepare import with_maps_to_mesh
+from surfkit.scene.camera import Camera
+from surfkit.scene.memory import cache_bytes
+from surfkit.scene.scene import View
+from surfkit.train.bars import bars
+
+
+def open_run(out: str | Path, *, device: Device = "auto") -> TrainedRun:
+    """A finished run in a folder.
+
+    Raises:
+        BadInput: It holds no run, or one that is not finished, or its data have changed since.
+    """
+    return TrainedRun(Path(out), device)
+
+
+@dataclass
+class TrainedRun:
+    """A finished run. It is read when it is first needed, and kept until `close` or the end of a `with` block.
+
+    Attributes:
+        out: Its folder.
+        device: For drawing.
+    """
+
+    out: Path
+    device: Device = "auto"
+    _use: ExitStack = field(default_factory=ExitStack, repr=False)
+
+    def __post_init__(self) -> None:
+        pipeline.opened(self.out)
+
+    def __enter__(self) -> TrainedRun:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free what is in memory."""
+        self._use.close()
+        self.__dict__.pop("_loaded", None)
+
+    @cached_property
+    def _loaded(self) -> tuple[RunContext, Reconstruction]:
+        return self._use.enter_context(pipeline.loaded(self.out, self.device))
+
+    @property
+    def recipe(self) -> Recipe:
+        """What it was trained by."""
+        return pipeline.opened(self.out).recipe
+
+    @property
+    def dataset(self) -> Dataset:
+        """What it was trained on."""
+        ctx = self._loaded[0]
+        return Dataset(ctx.run.data, ctx.scene)
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """All that has been measured, as metrics.json has it."""
+        path = self._loaded[0].run.metrics
+        return read_json(path, dict[str, Any]) if path.exists() else {}
+
+    @property
+    def splats(self) -> SplatTable:
+        """The splats, frame of the input: `means` (N, 3), `opacities` (N,), `scales`, `quats` (N, 4), and so on.
+
+        Raises:
+            BadInput: Its method makes none.
+        """
+        ctx, made = self._loaded
+        model = splats_of(ctx.run, made)
+        return model.primitive.table(model.params).in_input_frame(ctx.scene.frame)
+
+    def render(self, camera: Camera | View) -> Maps:
+        """What a camera sees: `color` (3, H, W) in [0, 1], `alpha`, `depth` and `median` (H, W), `normal` (3, H, W).
+
+        Depths are in local units: divided by `dataset.frame.scale` they are those of the input.
+
+        Args:
+            camera: A view of the data set, or a camera in the local frame; `dataset.camera(...)` makes one.
+
+        Raises:
+            BadInput: Nothing can be drawn of what its method makes.
+        """
+        ctx, made = self._loaded
+        refuse_not_drawn(ctx.run)
+        view = camera if isinstance(camera, View) else View("camera", camera, Path("camera"))
+        with torch.no_grad():
+            return made.draw(view)
+
+    def mesh(self, mesher: str | Mesher | None = None, *, memory: str = "auto", **settings: Any) -> Mesh:
+        """Make the mesh again, write it to the run folder as `surfkit mesh` does, and return it.
+
+        Args:
+            mesher: "tsdf", "visibility" or another by its name, or itself; by default that of the recipe.
+            memory: To be used, such as "4GB".
+            settings: Of the mesher (`voxel=0.2`), and of what is written (`triangles=100_000`, `watertight=True`).
+
+        Raises:
+            BadInput: A setting that neither has, or there is no surface.
+        """
+        ctx, made = self._loaded
+        run, scene = ctx.run, ctx.scene
+        written = {each.name for each in fields(MeshOutput)}
+        output = MeshOutput(**{name: value for name, value in settings.items() if name in written})
+        chosen = _mesher(mesher, self.recipe.mesh or TSDF())
+        for name, value in settings.items():
+            if name not in written:
+                chosen = evolve(chosen, name, value)
+        chosen.ready()
+        with collect_notes(), bars(), locked(run.out), _maps(run, made, chosen, ctx, self.device) as with_maps:
+            what = mesh_input(with_maps, made, scene, ctx.rasterizer, cache_bytes(memory, "memory"), chosen)
+            make_mesh(with_maps, chosen if made.mesh is None else made.mesh, output, what, made.last_steps)
+        return Mesh.read(run.out / "mesh.ply" if "ply" in output.formats else run.out / f"mesh.{output.formats[0]}")
+
+    def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:
+        """Measure: on the held-out photographs, or the run's mesh against the truth.
+
+        Args:
+            gt: Point cloud, mesh or raster of heights that is the truth.
+            settings: With `gt`: of the comparison, `tau=0.5`, `crop="none"`; see `Comparison`.
+
+        Raises:
+            BadInput: Nothing to measure, or files that do not belong together.
+        """
+        ctx, made = self._loaded
+        with collect_notes(), bars(), locked(ctx.run.out):
+            if gt is None:
+                if settings:
+                    raise BadInput(f"evaluate: {next(iter(settings))} has no effect without gt; leave it out")
+                return Figures(evaluate(ctx.run, made, ctx.scene))
+            known = [each.name for each in fields(Comparison)]
+            for name in settings:
+                if name not in known:
+                    raise BadInput(f"evaluate: {unknown('setting', name, known)}")
+            pair, folder = (ctx.run.mesh, Path(gt)), ctx.run.out / "geometry"
+            found = measure_geometry(pair, Comparison(**settings), folder, ctx.scene.train, ctx.scene.frame)
+            return Figures(note_metrics(ctx.run.metrics, found))
+
+    def export(self, path: str | Path, format: str | Format | None = None) -> Path:  # noqa: A002 (the word that fits)
+        """Write the splats to a file for other programs.
+
+        Args:
+            path: File; its suffix says the format: .ply, .spz, .sog, .splat, and so on.
+            format: Its name, or itself, where the suffix does not say.
+
+        Raises:
+            BadInput: No such format, or the splats have no place in it.
+        """
+        path, (ctx, made) = Path(path), self._loaded
+        form = format if isinstance(format, Format) else find(Format, format)() if format else _format_of(path)
+        tree = None
+        if form.wants_tree:
+            if not ctx.run.lod_record.exists():
+                raise BadInput(
+                    f"{path}: this format takes levels of detail, and there are none; surfkit lod makes them"
+                )
+            tree = load_levels(ctx.run, splats_of(ctx.run, made)).tiles(ctx.scene.frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        form.write(path, self.splats, ctx.scene.frame, tree)
+        return path
+
+
+def _mesher(given: str | Mesher | None, default: Mesher) -> Mesher:
+    if given is None or isinstance(given, Mesher):
+        return given or default
+    return find(Mesher, given.removeprefix("mesh:"))()
+
+
+@contextmanager
+def _maps(run: Run, made: Reconstruction, mesher: Mesher, ctx: RunContext, device: Device) -> Iterator[Run]:
+    """Within, the run with the depth maps that a mesher needs."""
+    if made.mesh is not None:
+        yield run
+        return
+    with with_maps_to_mesh(run, mesher, ctx.scene, ctx.caches, device) as with_maps:
+        yield with_maps
+
+
+def _format_of(path: Path) -> Format:
+    """The format whose suffix a file has, the longest first."""
+    known = {cls.suffix: cls for cls in components(Format).values() if cls.suffix}
+    for suffix in sorted(known, key=len, reverse=True):
+        if path.name.lower().endswith(suffix):
+            return known[suffix]()
+    raise BadInput(f"{path}: {path.suffix or 'no suffix'} is no format of splats; known: {', '.join(sorted(known))}")
