@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -23,7 +24,10 @@ class Listener:
     def surfkit_event(self, event: object) -> None:
         """Pass a step on, and keep a warning."""
         if isinstance(event, StepDone) and self.on_step is not None:
-            self.on_step(event)
+            try:
+                self.on_step(event)
+            except KeyboardInterrupt:
+                signal.raise_signal(signal.SIGINT)  # as Ctrl-C: the step is finished, and the state saved
         if isinstance(event, Warned):
             self.texts.append(event.text)
 

@@ -1,0 +1,131 @@
+"""surfkit in Python: the page and the notebook run as they stand, on a made-up scene, and agree with the commands."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import torch
+from models import data_set
+from pages import ROOT, code
+
+import surfkit
+from surfkit.cli import main
+
+TINY = {"SCENE": "scene", "scale=4": "scale=1", "steps=100": "steps=12", "triangles=50_000": "triangles=500"}
+"""What is smaller here than on the page."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a data set, in which a run has been trained and used as the page does."""
+    found = tmp_path_factory.mktemp("python")
+    data_set(found / "scene")
+    return found
+
+
+def executed(text, folder, names):
+    for long, short in TINY.items():
+        text = text.replace(long, short)
+    before = os.getcwd()
+    os.chdir(folder)
+    try:
+        exec(compile(text, "page", "exec"), names)  # what users paste
+    finally:
+        os.chdir(before)
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    names = {}
+    for block in code(ROOT / "docs" / "python.md"):
+        assert block.language == "python"
+        executed(block.text, folder, names)
+    return names
+
+
+def test_the_page_runs(page, folder):
+    assert len(page["losses"]) == 12 and page["maps"].color.shape[0] == 3
+    assert page["picture"].dtype == np.uint8 and page["picture"].std() > 1, "the moved camera sees the scene"
+    assert page["figures"].f1 > 0.9, "the mesh against itself"
+    assert (folder / "site.glb").stat().st_size > 1000 and (folder / "site.spz").stat().st_size > 100
+    assert json.loads((folder / "RUN-fixed" / "recipe.json").read_text())["seed"] == 7
+
+
+def test_the_notebook_runs(folder):
+    book = json.loads((ROOT / "examples" / "notebook.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in book["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) > 3
+    names = {}
+    for cell in cells:
+        cell = cell.replace("boruszyn", "scene").replace("scale=8", "scale=1").replace("steps=300", "steps=12")
+        executed("\n".join(line for line in cell.splitlines() if not line.startswith("%")), folder, names)
+
+
+def test_the_same_run_as_by_the_command(page, folder, tmp_path, capsys):
+    words = ["--data", str(folder / "scene"), "--out", str(tmp_path / "run"), "--steps", "12", "--test-every", "8"]
+    assert main(["train", "recipe:2dgs", *words, "--scale", "1"]) == 0
+    ours = surfkit.open(tmp_path / "run")
+    theirs = surfkit.open(folder / "RUN")
+    assert torch.equal(ours.splats.means, theirs.splats.means)
+    main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "by_command.spz")])
+    assert (tmp_path / "by_command.spz").read_bytes() == (folder / "site.spz").read_bytes()
+
+
+def test_a_camera_sees_its_target_in_the_middle(folder):
+    scene = surfkit.read(folder / "scene")
+    target = np.array([0.3, -0.2, 0.5])
+    camera = scene.camera(target + [1.0, 2.0, 4.0], target)
+    x, y, z = camera.project(torch.from_numpy(scene.frame.to_local(target[None])))[0].tolist()
+    assert (x, y) == pytest.approx((camera.cx, camera.cy), abs=1e-6)
+    assert z / scene.frame.scale == pytest.approx(np.linalg.norm([1.0, 2.0, 4.0]))
+    above = target + [0, 0, 0.1]
+    assert camera.project(torch.from_numpy(scene.frame.to_local(above[None])))[0, 1] < camera.cy, "up is up"
+
+
+def test_a_step_may_stop_the_run(folder, tmp_path):
+    def stop(step):
+        if step.index == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        surfkit.train("2dgs", folder / "scene", tmp_path / "run", steps=12, on_step=stop)
+    with pytest.raises(surfkit.BadInput, match="5 of 12"):
+        _ = surfkit.open(tmp_path / "run").splats
+    seen = []
+    surfkit.train("2dgs", folder / "scene", tmp_path / "run", steps=12, on_step=lambda step: seen.append(step.index))
+    assert seen == list(range(6, 13)), "it goes on where it stopped"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda scene, run: surfkit.read("nowhere"), "nowhere"),
+        (lambda scene, run: surfkit.read(scene, scales=2), "did you mean 'scale'"),
+        (lambda scene, run: surfkit.train("sufrace", scene, "x"), "did you mean 'surface'"),
+        (lambda scene, run: run.mesh(voxels=2), "no 'voxels'"),
+        (lambda scene, run: run.mesh("tdsf"), "did you mean 'tsdf'"),
+        (lambda scene, run: run.export("x.foo"), "known: .*ply"),
+        (lambda scene, run: run.evaluate(tau=3), "tau has no effect without gt"),
+        (lambda scene, run: run.evaluate(gt=run.out / "mesh.ply", taus=3), "did you mean 'tau'"),
+        (lambda scene, run: run.evaluate().f1, "f1 was not measured"),
+        (lambda scene, run: run.dataset.camera((0, 0, 0), (0, 0, 1)), "give another `up`"),
+        (lambda scene, run: surfkit.open(scene), "no run folder"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(page, folder, wrong, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = surfkit.open(folder / "RUN")
+    if "f1" in said:
+        run.metrics.pop("geometry", None)
+        path = folder / "RUN" / "metrics.json"
+        path.write_text(json.dumps({name: it for name, it in run.metrics.items() if name != "geometry"}))
+    with pytest.raises(surfkit.BadInput, match=said) as error:
+        wrong(folder / "scene", run)
+    assert "\n" not in str(error.value)
+
+
+def test_train_is_a_function_and_a_folder():
+    from surfkit.train.stage import Stage
+
+    assert callable(surfkit.train) and surfkit.train.stage.Stage is Stage
