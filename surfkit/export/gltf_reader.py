@@ -16,14 +16,14 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.export.axes import Axes, FileAxes, turn_between
 from surfkit.export.bits import unit
-from surfkit.export.glb import Document, read_glb
+from surfkit.export.glb import UNLIT, Document, read_glb
 from surfkit.export.spz import SPZ_ROUNDING, spz_table
 from surfkit.export.table import COLUMNS, SplatTable
 from surfkit.export.turn import parts_of, turned
 
 SPLATS = "KHR_gaussian_splatting"
 COMPRESSED = "KHR_gaussian_splatting_compression_spz_2"
-UNDERSTOOD = {SPLATS, COMPRESSED, "KHR_materials_unlit", "KHR_mesh_quantization"}
+UNDERSTOOD = {SPLATS, COMPRESSED, UNLIT, "KHR_mesh_quantization"}
 """Extensions that a file may require."""
 UPS = {
     "y": np.eye(3),

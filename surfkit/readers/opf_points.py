@@ -18,12 +18,12 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.export.glb import WIDTHS
 from surfkit.readers.camera_files import numbers
 from surfkit.readers.capture import shorten
 
 KINDS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Types of glTF's components."""
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From glTF's frame to that of the project."""
 MATCHES = "OPF_mesh_primitive_matches"
