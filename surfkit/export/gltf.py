@@ -22,12 +22,13 @@ import torch
 from surfkit.core.version import own_version
 from surfkit.export.axes import turn_between
 from surfkit.export.base import Format
-from surfkit.export.bits import SH_C0, to_bytes, unit
+from surfkit.export.bits import SH_C0, to_bytes
 from surfkit.export.glb import BYTE, FLOAT, MAGIC, VERTICES, Blocks, write_glb
 from surfkit.export.gltf_reader import COMPRESSED, LEAST, SPLATS, UPS, harmonics, read_splats
 from surfkit.export.spz import SPZ, spz_bytes, spz_table
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.turn import turned
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import FAR, Frame
 
 Compress = Literal["none", "spz"]
