@@ -103,7 +103,7 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
         crs: Coordinate reference system, or "auto" for the zone of UTM.
 
     Raises:
-        BadInput: The coordinate reference system is not known, or is none of east, north and up, or pyproj is missing.
+        BadInput: The coordinate reference system is not known, or is none of east, north and up.
     """
     heights = positions[np.isfinite(positions[:, 2]), 2]
     plan = np.column_stack([positions[:, 0], _unbroken(positions[:, 1])])
