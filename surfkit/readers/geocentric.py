@@ -11,8 +11,8 @@ from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.readers.georeference import POLAR, Similarity, zone_of
-from surfkit.scene.crs import code_in, exact, from_wkt, in_plan
+from surfkit.readers.georeference import Similarity
+from surfkit.scene.crs import POLAR, code_in, exact, from_wkt, in_plan, zone_of
 from surfkit.scene.earth import AXIS, FLATTENING, to_ecef, utm
 
 WGS84 = ("EPSG:4326", "EPSG:4979")

@@ -26,6 +26,8 @@ TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+
 EGM96 = "+5773"
 """What the code of a map ends with where heights are above sea level by EGM96, the geoid that receivers of GPS know."""
 UTM = re.compile(rf"EPSG:32([67])(0[1-9]|[1-5]\d|60)({re.escape(EGM96)})?", re.IGNORECASE)
+POLAR, BESIDE = 84.0, 30.0
+"""Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
 DEGREES = "EPSG:4326"
 UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
 """Short names of units of length, by those of EPSG."""
@@ -149,6 +151,12 @@ def is_plain(crs: str) -> bool:
     """Whether it is a zone of UTM on WGS 84, with or without heights by EGM96, or a topocentric frame, in metres: they
     are computed here, but for the heights of the geoid."""
     return bool(UTM.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
+
+
+def zone_of(crs: str) -> tuple[int, bool] | None:
+    """Number of a zone of UTM on WGS 84, and whether it is south of the equator; None for any other system."""
+    found = UTM.fullmatch(crs)
+    return (int(found[2]), found[1] == "7") if found and not found[3] else None
 
 
 def known_axes(crs: str) -> Axes | None:

@@ -1,4 +1,4 @@
-"""Coordinate reference systems as lists of positions and of ground control points name them."""
+"""Coordinate reference systems as OpenDroneMap, and lists of positions and of ground control points, name them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.readers.georeference import BESIDE, POLAR, zone_of
-from surfkit.scene.crs import code_in, exact, from_wkt
+from surfkit.scene.crs import BESIDE, POLAR, code_in, exact, from_wkt, zone_of
 from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
@@ -50,7 +49,7 @@ class System:
         """
         if self.crs == WGS84_DEGREES:
             return xyz[:, [1, 0, 2]]
-        if self.crs.startswith("EPSG:") and (zone := zone_of(self.crs)):
+        if zone := zone_of(self.crs):
             found = np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
             away = np.abs(found[:, 1] - (6 * zone[0] - 183))
             found[~((np.abs(found[:, 0]) <= POLAR) & (away < BESIDE)), :2] = np.nan
@@ -98,7 +97,7 @@ def system_of(text: str) -> System:
 
 def covers(crs: str, latitude: float, longitude: float) -> bool:
     """Whether a system is meant for a place; True where it does not say what it is meant for."""
-    if zone := zone_of(crs.upper()):
+    if zone := zone_of(crs):
         away = abs((longitude - (6 * zone[0] - 183) + 180) % 360 - 180)
         return away < 6 and abs(latitude) <= POLAR and (latitude < 1 if zone[1] else latitude > -1)
     try:
