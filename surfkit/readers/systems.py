@@ -125,7 +125,7 @@ def _by_pyproj(text: str) -> System:
     shown = text if len(text) <= 60 else f"{text[:60]}..."
     try:
         found = CRS(text)
-    except ProjError as error:
+    except (ProjError, UnicodeEncodeError) as error:
         raise BadInput(
             f"{shown!r} is no coordinate reference system that pyproj knows; name one such as EPSG:32633, "
             "WGS84 UTM 33N or EPSG:4326"

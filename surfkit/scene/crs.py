@@ -73,7 +73,7 @@ def parsed(crs: str) -> CRS:
     """
     try:
         return CRS(crs)
-    except ProjError as error:
+    except (ProjError, UnicodeEncodeError) as error:  # the latter of half a character, as JSON may have it
         said = " ".join(str(error).split())[:200].removeprefix(f"Invalid projection: {crs}: ")
         raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place it on Earth: {said}") from error
 
@@ -86,7 +86,7 @@ def from_wkt(where: str, text: str) -> CRS:
     """
     try:
         return CRS.from_wkt(text)
-    except CRSError as error:
+    except (CRSError, UnicodeEncodeError) as error:
         said = " ".join(str(error).rpartition("proj_create: ")[2].removesuffix(")").split())[:200]
         raise BadInput(
             f"{where}: no coordinate reference system that pyproj reads: {said}; export it again, in another one such "

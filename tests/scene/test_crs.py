@@ -137,6 +137,7 @@ def test_no_code_is_guessed_from_what_is_alike():
         ("PROJCS[", "missing ];"),
         ('PROJCS["a",UNIT["metre",1],AUTHORITY["EPSG","32632"]]', "missing CONVERSION node;"),
         ("PROJCS[" * 1000, "too many nesting levels;"),
+        ('PROJCS["\ud800"]', "'utf-8' codec can't encode character '\\ud800' in position 8: surrogates not allowed;"),
     ],
 )
 def test_a_text_that_is_none_is_refused_in_one_line(text, why):
