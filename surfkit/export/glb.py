@@ -91,7 +91,7 @@ def glb(
         document: Without buffers, bufferViews and accessors, which are added.
         blocks: Of these.
         remedy: What to do where it is too large, for the message.
-        spaced: Whether spaces follow the commas and colons of the JSON.
+        spaced: Whether spaces follow the commas and colons of the JSON, as they always have in meshes.
 
     Raises:
         BadInput: More than 4 GiB; before anything else.

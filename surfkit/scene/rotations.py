@@ -42,7 +42,7 @@ def quaternions(turns: Tensor) -> Tensor:
 
 
 def unit(quats: np.ndarray) -> np.ndarray:
-    """(N, 4) float64 quaternions wxyz of length 1, of any length; one of length 0 turns nothing."""
+    """(N, 4) float64 quaternions of length 1 of (N, 4) wxyz of any length; one of length 0 turns nothing."""
     wide = quats.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.where(length > 0, wide, [1.0, 0, 0, 0]) / np.where(length > 0, length, 1)
