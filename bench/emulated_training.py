@@ -24,6 +24,7 @@ from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.psnr import psnr
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
@@ -67,14 +68,11 @@ def trained(scene: Scene, stage: Stage, rasterizer: Rasterizer) -> tuple[StageSt
     return state, time.perf_counter() - began
 
 
-def psnr(scene: Scene, state: StageState, stage: Stage, rasterizer: Rasterizer) -> float:
+def decibels(scene: Scene, state: StageState, stage: Stage, rasterizer: Rasterizer) -> float:
     """Of the training views, drawn on the CPU."""
     splats = Surfel2D(sh_degree=3).activate(state.points.params, state.sh_degree)
-    errors = []
-    for view in scene.train:
-        color = rasterizer.render(splats, view.camera, stage.near, geometry=False).maps.color.clamp(0, 1)
-        errors.append((color - view_photo(view).float() / 255).square().mean())
-    return float(-10 * torch.stack(errors).mean().log10())
+    colors = [rasterizer.render(splats, view.camera, stage.near, geometry=False).maps.color for view in scene.train]
+    return psnr(torch.stack(colors), torch.stack([view_photo(view) for view in scene.train]) / 255)
 
 
 def main() -> None:
@@ -97,7 +95,7 @@ def main() -> None:
             "steps": options.steps,
             "points": [len(here.points), len(there.points)],
             "points at the start": len(scene.cloud.xyz),
-            "PSNR": [round(psnr(scene, state, stage, cpu), 4) for state in (here, there)],
+            "PSNR": [round(decibels(scene, state, stage, cpu), 4) for state in (here, there)],
             "seconds": [round(seconds, 1), round(emulated, 1)],
         }
     if len(here.points) == len(there.points):

@@ -22,6 +22,7 @@ from scipy import ndimage
 
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.mesh.shade import draw_faces
+from surfkit.raster.psnr import psnr
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.scene.photos import view_photo
@@ -135,10 +136,8 @@ def main(maps: Path, data: Path, truth: Path) -> None:
     grey, reference = np.where(alpha > 0, np.mean(colors, 0), np.nan), exact_orthophoto(exact, place, data, truth)
     found = corners_of(exact, place, read_surface(truth).vertices())
     both = np.isfinite(grey) & np.isfinite(reference)
-    error = (grey - reference)[both]
-    print(
-        f"orthophoto and the mean of the photographs: PSNR {10 * np.log10(255**2 / np.mean(error**2)):.2f} dB, ", end=""
-    )
+    alike = psnr(torch.from_numpy(grey[both] / 255), torch.from_numpy(reference[both] / 255))
+    print(f"orthophoto and the mean of the photographs: PSNR {alike:.2f} dB, ", end="")
     print(f"mean gradient {gradient(grey, both):.2f} and {gradient(reference, both):.2f}")
     shifts = np.array([shift_of(grey, reference, row, column) for row, column in found])
     print(f"orthophoto at {len(found)} corners of roofs: {np.isfinite(shifts).sum()} found, within 1 cell ", end="")

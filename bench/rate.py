@@ -25,12 +25,12 @@ from surfkit.compress.container import read_model, write_model
 from surfkit.compress.packed import Packed
 from surfkit.compress.plain import Float16
 from surfkit.core.registry import find
-from surfkit.evaluate.images.measure import psnr
 from surfkit.export.base import Format
 from surfkit.pipeline import loaded
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.api import Rasterizer
+from surfkit.raster.psnr import psnr
 from surfkit.run.context import RunContext
 from surfkit.run.method import splats_of
 from surfkit.scene.photos import view_photo

@@ -16,6 +16,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from machine import save
 from PIL import Image
@@ -26,6 +27,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.simplify import simplify_to
 from surfkit.pipeline import opened
+from surfkit.raster.psnr import psnr
 from surfkit.readers.read import read
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import view_photo
@@ -98,11 +100,6 @@ class Textured:
         return drawn.picture(color)
 
 
-def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    """In dB, of colours from 0 to 255."""
-    return float(10 * np.log10(255**2 / np.mean((one - other) ** 2)))
-
-
 def gradient(picture: np.ndarray, where: np.ndarray) -> float:
     """Mean absolute difference of the grey of neighbouring pixels, a measure of sharpness."""
     grey = picture.mean(2)
@@ -135,7 +132,7 @@ def main() -> None:
             made[name] = drawn.picture(drawn.of_corners(mesh.colors.astype(np.float64)))
         where = np.all([there for _, there in made.values()], axis=0)
         for name, (picture, _) in made.items():
-            scores[name].append(psnr(picture[where], photo[where]))
+            scores[name].append(psnr(torch.from_numpy(picture[where] / 255), torch.from_numpy(photo[where] / 255)))
             sharp[name].append(gradient(picture, where))
         sharp["photograph"].append(gradient(photo, where))
         if asked.pictures:

@@ -15,7 +15,10 @@ GEOCENTRIC = (
     'GEOGCS["WGS 84",DATUM["WGS 84",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",'
     '0.0174532925199433],AUTHORITY["EPSG","4326"]]'
 )
-UTM = f'PROJCS["WGS 84 / UTM zone 32N",{GEOCENTRIC},UNIT["metre",1],AUTHORITY["EPSG","32632"]]'
+UTM = (
+    f'PROJCS["WGS 84 / UTM zone 32N",{GEOCENTRIC},PROJECTION["Transverse_Mercator"],PARAMETER["central_meridian",9],'
+    'PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],UNIT["metre",1],AUTHORITY["EPSG","32632"]]'
+)
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 

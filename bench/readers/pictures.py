@@ -7,9 +7,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import torch
 from check import Row, failed
 from PIL import Image
 from programs import HERE, Missing, find_chromium, is_as_in_ply, node, three
+
+from surfkit.raster.psnr import psnr
 
 TIMES = 3
 """Pixels of a picture for one of the photograph, on each side."""
@@ -105,4 +108,5 @@ def _judged(shot: dict, answer: dict, wanted: np.ndarray, folder: Path) -> Row:
 
 
 def _psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / max(((a - b) ** 2).mean(), 1e-9)))
+    """Of colours from 0 to 255."""
+    return psnr(torch.tensor(a / 255), torch.tensor(b / 255))

@@ -12,7 +12,7 @@ from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
     "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "kornia": "features", "laspy": "maps",
-    "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps", "pyproj": "crs",
+    "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps",
     "rasterio": "maps", "ray": "ray", "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth",
     "trimesh": "mesh", "viser": "view",
 }  # fmt: skip

@@ -44,13 +44,6 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
     return (values + 0.5).clip(0, 255).astype(np.uint8)
 
 
-def unit(quats: np.ndarray) -> np.ndarray:
-    """(N, 4) float64 quaternions of length 1; one of length 0 turns nothing."""
-    wide = quats.astype(np.float64)
-    length = np.linalg.norm(wide, axis=1, keepdims=True)
-    return np.where(length > 0, wide, [1.0, 0, 0, 0]) / np.where(length > 0, length, 1)
-
-
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations without their largest component, which the others imply.
 

@@ -22,9 +22,10 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.export.base import Format
-from surfkit.export.bits import SH_C0, from_smallest_three, logits, outlying_order, sigmoid, smallest_three, unit
+from surfkit.export.bits import SH_C0, from_smallest_three, logits, outlying_order, sigmoid, smallest_three
 from surfkit.export.ply import Elements, mode_of, read_elements, shifted
 from surfkit.export.table import SplatTable, Tile
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
 CHUNK = 256

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,12 @@ MOST_NUMBER = 1e30
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Scalars of accessors, as numpy calls them."""
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-VERTICES = 34962
-"""Target of a buffer view of vertex attributes."""
-FLOAT, SHORT = 5126, 5123
+BYTE, SHORT, INT, FLOAT = 5121, 5123, 5125, 5126
+"""Types of components, without a sign but FLOAT."""
+VERTICES, INDICES = 34962, 34963
+"""Targets of buffer views."""
+UNLIT = "KHR_materials_unlit"
+"""The extension for what is to be shown as it is: photographs have the light of the day in them."""
 
 
 @dataclass
@@ -54,10 +57,9 @@ class Blocks:
         self.makers.append(make)
         return len(self.views) - 1
 
-    def accessor(self, view: int | None, count: int, kind: str, scalar: int = FLOAT, **more: Any) -> int:
-        """Index of a new accessor of a buffer view; None where an extension brings the values."""
-        where = {} if view is None else {"bufferView": view}
-        self.accessors.append({**where, "componentType": scalar, "count": count, "type": kind, **more})
+    def accessor(self, view: int | None, **about: Any) -> int:
+        """Index of a new accessor, `about` in its JSON, of a buffer view; None where an extension has the values."""
+        self.accessors.append(about if view is None else {"bufferView": view, **about})
         return len(self.accessors) - 1
 
     @property
@@ -79,35 +81,42 @@ def linear_colors(srgb: np.ndarray) -> np.ndarray:
     return colors
 
 
-def write_glb(path: Path, document: dict[str, Any], blocks: Blocks) -> None:
-    """Save a document with its bytes.
+def glb(
+    where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str, spaced: bool = False
+) -> Iterator[bytes]:
+    """A document with its bytes, as a GLB file has them, part after part.
 
     Args:
-        path: Appears only when it is complete.
+        where: What it is, for the message.
         document: Without buffers, bufferViews and accessors, which are added.
         blocks: Of these.
+        remedy: What to do where it is too large, for the message.
+        spaced: Whether spaces follow the commas and colons of the JSON, as they always have in meshes.
 
     Raises:
-        BadInput: More than 4 GiB.
+        BadInput: More than 4 GiB; before anything else.
     """
     if blocks.views:
         buffers = {"buffers": [{"byteLength": blocks.length}], "bufferViews": blocks.views}
         document = {**document, **buffers, "accessors": blocks.accessors}
-    text = json.dumps(document, separators=(",", ":")).encode()
+    text = json.dumps(document, separators=None if spaced else (",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + (8 + blocks.length if blocks.views else 0)
     if total > MOST_BYTES:
-        raise BadInput(
-            f"{path}: {total} bytes; a GLB file has at most {MOST_BYTES}: use the format tiles3d, or compress"
-        )
+        raise BadInput(f"{where}: {total} bytes; a GLB file has at most {MOST_BYTES}: {remedy}")
+    yield struct.pack("<4sII", MAGIC, 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
+    if blocks.views:
+        yield struct.pack("<I4s", blocks.length, b"BIN\0")
+    for view, make in zip(blocks.views, blocks.makers, strict=True):
+        data = make()
+        assert len(data) == view["byteLength"]
+        yield data + b"\0" * (-len(data) % 4)
+
+
+def write_glb(path: Path, document: dict[str, Any], blocks: Blocks, remedy: str, spaced: bool = False) -> None:
+    """Save what `glb` gives as a file, which appears only when it is complete."""
     with replacing(path) as file:
-        file.write(struct.pack("<4sII", MAGIC, 2, total) + struct.pack("<I4s", len(text), b"JSON") + text)
-        if blocks.views:
-            file.write(struct.pack("<I4s", blocks.length, b"BIN\0"))
-        for view, make in zip(blocks.views, blocks.makers, strict=True):
-            data = make()
-            assert len(data) == view["byteLength"]
-            file.write(data + b"\0" * (-len(data) % 4))
+        file.writelines(glb(path, document, blocks, remedy, spaced))
 
 
 def read_glb(path: Path) -> Document:

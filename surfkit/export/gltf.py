@@ -22,12 +22,13 @@ import torch
 from surfkit.core.version import own_version
 from surfkit.export.axes import turn_between
 from surfkit.export.base import Format
-from surfkit.export.bits import SH_C0, to_bytes, unit
-from surfkit.export.glb import MAGIC, VERTICES, Blocks, write_glb
+from surfkit.export.bits import SH_C0, to_bytes
+from surfkit.export.glb import BYTE, FLOAT, MAGIC, VERTICES, Blocks, write_glb
 from surfkit.export.gltf_reader import COMPRESSED, LEAST, SPLATS, UPS, harmonics, read_splats
 from surfkit.export.spz import SPZ, spz_bytes, spz_table
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.turn import turned
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import FAR, Frame
 
 Compress = Literal["none", "spz"]
@@ -118,7 +119,7 @@ def write_splats(path: Path, table: SplatTable, turn: np.ndarray, compress: Comp
         document["extensionsUsed"] = extensions_of(compress)
         if compress == "spz":
             document["extensionsRequired"] = extensions_of(compress)
-    write_glb(path, document, blocks)
+    write_glb(path, document, blocks, "use the format tiles3d, or compress")
 
 
 def extensions_of(compress: Compress) -> list[str]:
@@ -150,13 +151,13 @@ def _plain(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
     for name, at in harmonics(table.sh_degree):
         columns[name] = ("VEC3", lambda at=at: table.sh_rest[:, at].numpy())
     view = blocks.add(12 * count, lambda: _bytes(means.numpy()), target=VERTICES)
-    attributes = {"POSITION": blocks.accessor(view, count, "VEC3", min=low, max=high)}
+    attributes = {"POSITION": blocks.accessor(view, componentType=FLOAT, count=count, type="VEC3", min=low, max=high)}
     view = blocks.add(4 * count, lambda: _fallback(table), target=VERTICES)
-    attributes["COLOR_0"] = blocks.accessor(view, count, "VEC4", 5121, normalized=True)
+    attributes["COLOR_0"] = blocks.accessor(view, componentType=BYTE, count=count, type="VEC4", normalized=True)
     for name, (kind, make) in columns.items():
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[kind]
         view = blocks.add(4 * width * count, lambda make=make: _bytes(make()), target=VERTICES)
-        attributes[f"{SPLATS}:{name}"] = blocks.accessor(view, count, kind)
+        attributes[f"{SPLATS}:{name}"] = blocks.accessor(view, componentType=FLOAT, count=count, type=kind)
     about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "extensions": {SPLATS: {**about, "projection": "perspective"}}}
 
@@ -169,13 +170,13 @@ def _compressed(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]
     low, high = (value.tolist() for value in torch.aminmax(stored.means.float(), dim=0))
     count = len(table)
     attributes = {
-        "POSITION": blocks.accessor(None, count, "VEC3", min=low, max=high),
-        "COLOR_0": blocks.accessor(None, count, "VEC4", 5121, normalized=True),
-        f"{SPLATS}:SCALE": blocks.accessor(None, count, "VEC3"),
-        f"{SPLATS}:ROTATION": blocks.accessor(None, count, "VEC4"),
+        "POSITION": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC3", min=low, max=high),
+        "COLOR_0": blocks.accessor(None, componentType=BYTE, count=count, type="VEC4", normalized=True),
+        f"{SPLATS}:SCALE": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC3"),
+        f"{SPLATS}:ROTATION": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC4"),
     }
     for name, _ in harmonics(table.sh_degree):
-        attributes[f"{SPLATS}:{name}"] = blocks.accessor(None, count, "VEC3")
+        attributes[f"{SPLATS}:{name}"] = blocks.accessor(None, componentType=FLOAT, count=count, type="VEC3")
     view = blocks.add(len(data), lambda: data)
     return {"attributes": attributes, "extensions": {SPLATS: {"extensions": {COMPRESSED: {"bufferView": view}}}}}
 

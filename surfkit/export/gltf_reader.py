@@ -15,15 +15,15 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.export.axes import Axes, FileAxes, turn_between
-from surfkit.export.bits import unit
-from surfkit.export.glb import Document, read_glb
+from surfkit.export.glb import UNLIT, Document, read_glb
 from surfkit.export.spz import SPZ_ROUNDING, spz_table
 from surfkit.export.table import COLUMNS, SplatTable
 from surfkit.export.turn import parts_of, turned
+from surfkit.scene.rotations import numpy_rotations
 
 SPLATS = "KHR_gaussian_splatting"
 COMPRESSED = "KHR_gaussian_splatting_compression_spz_2"
-UNDERSTOOD = {SPLATS, COMPRESSED, "KHR_materials_unlit", "KHR_mesh_quantization"}
+UNDERSTOOD = {SPLATS, COMPRESSED, UNLIT, "KHR_mesh_quantization"}
 """Extensions that a file may require."""
 UPS = {
     "y": np.eye(3),
@@ -134,14 +134,10 @@ def _matrix(document: Document, node: dict[str, Any], index: int) -> np.ndarray:
     where = f"nodes[{index}]"
     if "matrix" in node:
         return document.numbers(node["matrix"], 16, f"{where}.matrix").reshape(4, 4).T
-    x, y, z, w = unit(document.numbers(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")[None])[0]
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    x, y, z, w = document.numbers(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")
     matrix = np.eye(4)
-    matrix[:3, :3] = np.array(turn) * document.numbers(node.get("scale", [1, 1, 1]), 3, f"{where}.scale")
+    matrix[:3, :3] = numpy_rotations(np.array([[w, x, y, z]]))[0]
+    matrix[:3, :3] *= document.numbers(node.get("scale", [1, 1, 1]), 3, f"{where}.scale")
     matrix[:3, 3] = document.numbers(node.get("translation", [0, 0, 0]), 3, f"{where}.translation")
     return matrix
 

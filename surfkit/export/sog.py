@@ -26,11 +26,12 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.export.base import Format
-from surfkit.export.bits import sigmoid, smallest_three, to_bytes, unit
+from surfkit.export.bits import sigmoid, smallest_three, to_bytes
 from surfkit.export.palette import codebook, nearest, palette
 from surfkit.export.sog_reader import is_sog, read_sog
 from surfkit.export.table import SplatTable, Tile
 from surfkit.scene.morton import morton_order
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
 ROW = 64

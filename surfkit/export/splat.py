@@ -16,9 +16,10 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
 from surfkit.export.base import Format
-from surfkit.export.bits import SH_C0, logits, sigmoid, to_bytes, unit
+from surfkit.export.bits import SH_C0, logits, sigmoid, to_bytes
 from surfkit.export.ply import CHUNK
 from surfkit.export.table import SplatTable, Tile
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
 ROW = np.dtype([("xyz", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])

@@ -28,12 +28,13 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.export.axes import NAMES, PLY_AXES, FileAxes, turn_between
 from surfkit.export.base import Format
-from surfkit.export.bits import sigmoid, smallest_three, to_bytes, unit
+from surfkit.export.bits import sigmoid, smallest_three, to_bytes
 from surfkit.export.ply import CHUNK
 from surfkit.export.spz_reader import AXES_RECORD, COLOR, EXTENDED, HEADER, LARGEST, MAGIC, SMALLEST, STEP, decoded
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.turn import turned
 from surfkit.scene.morton import morton_order
+from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
 FINE = 64

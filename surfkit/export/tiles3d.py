@@ -24,6 +24,7 @@ from surfkit.export.gltf_reader import UPS, read_splats
 from surfkit.export.spz import SPZ
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.tileset import INDEX, box_json, ground_of, tileset
+from surfkit.scene.rotations import numpy_rotations
 from surfkit.scene.scene import Frame
 
 SIGMAS = 3.0
@@ -146,16 +147,7 @@ def _written(
 
 def box_of(table: SplatTable) -> np.ndarray:
     """(2, 3) corners of the box about all splats, `SIGMAS` standard deviations around each."""
-    quats = torch.nn.functional.normalize(table.quats.double(), dim=1)
-    w, x, y, z = quats.unbind(1)
-    turns = torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        dim=1,
-    ).reshape(-1, 3, 3)
+    turns = torch.from_numpy(numpy_rotations(table.quats.numpy()))
     reach = SIGMAS * (turns * table.ellipsoid_log_scales().double().exp()[:, None]).norm(dim=2)
     means = table.means.double()
     return np.stack([(means - reach).amin(0).numpy(), (means + reach).amax(0).numpy()])

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.export.table import SplatTable
+from surfkit.scene.rotations import numpy_quaternions
 
 TOLERANCE = 1e-4
 """Most by which the columns of a matrix may differ from perpendicular and equally long."""
@@ -105,6 +105,6 @@ def _turned_harmonics(rest: Tensor, turn: np.ndarray) -> Tensor:
 
 def _turned_quats(quats: Tensor, turn: np.ndarray) -> Tensor:
     """(N, 4) wxyz of the same lengths; a mirrored ellipsoid is the one turned by the opposite matrix."""
-    x, y, z, w = Rotation.from_matrix(turn * np.sign(np.linalg.det(turn))).as_quat()
+    w, x, y, z = numpy_quaternions(turn[None] * np.sign(np.linalg.det(turn)))[0]
     product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     return (quats.double() @ product.T).to(quats.dtype)

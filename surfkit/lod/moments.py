@@ -17,6 +17,7 @@ from surfkit.primitives.init import SH_C0
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import ALPHA_MAX, KINDS, Splats
+from surfkit.scene.rotations import numpy_quaternions, numpy_rotations
 from surfkit.scene.scene import Cloud
 
 SHAPE = ("means", "quats", "scales", "opacities")
@@ -75,7 +76,7 @@ class Shapes:
         scales = splats.scales.detach().double().cpu().numpy()
         return cls(
             splats.means.detach().double().cpu().numpy(),
-            rotations(splats.quats.detach().double().cpu().numpy()),
+            numpy_rotations(splats.quats.detach().double().cpu().numpy()),
             np.pad(scales, ((0, 0), (0, 3 - scales.shape[1]))),
             splats.opacities.detach().double().cpu().numpy(),
         )
@@ -142,7 +143,7 @@ def merged_model(model: SplatModel, labels: np.ndarray, weights: np.ndarray) -> 
     made = Shapes.of(model.splats).merged(labels, weights, flat)
     shape = {
         "means": made.means,
-        "quats": quaternions(made.turns),
+        "quats": numpy_quaternions(made.turns),
         "scales": made.scales[:, : columns["scales"].shape[0]],
         "opacities": made.opacities,
     }
@@ -179,21 +180,3 @@ def alike(splats: Splats, weights: np.ndarray) -> Alike:
     shapes = Shapes.of(splats)
     colors = 0.5 + SH_C0 * splats.sh[:, 0].detach().double().cpu().numpy()
     return Alike(shapes.means, weights, colors, shapes.normals)
-
-
-def rotations(quats: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of (N, 4) quaternions wxyz of any length."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
-
-
-def quaternions(turns: np.ndarray) -> np.ndarray:
-    """(N, 4) wxyz of (N, 3, 3) rotations."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(turns).as_quat()[:, [3, 0, 1, 2]]

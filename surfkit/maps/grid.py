@@ -105,7 +105,7 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
     than 2 cm where 1 km from the place and 100 m high. Without a reference the file states a local one with its unit.
 
     Raises:
-        BadInput: rasterio or pyproj is missing, or the system is unknown, has no easting and northing in units of
+        BadInput: rasterio is missing, or the system is unknown, has no easting and northing in units of
             length, has heights in another unit, does not keep lengths, or contradicts the unit of the data set.
     """
     with needed("rasterio", "surfkit maps"):

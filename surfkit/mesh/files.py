@@ -6,18 +6,15 @@ and trimesh 380, 1250 and 390; its PLY has floats only.
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 import numpy as np
 
-from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.export.glb import FLOAT, MOST_BYTES, SHORT, linear_colors
+from surfkit.export.glb import FLOAT, INDICES, INT, SHORT, VERTICES, Blocks, linear_colors, write_glb
 from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.scene.scene import Frame
 
@@ -32,7 +29,7 @@ def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     """Write a mesh in the format that the name ends in, and return the files that were written."""
     kind = Path(path).suffix.lower()
     if kind == ".glb":
-        return write_glb(path, mesh, frame)
+        return write_mesh_glb(path, mesh, frame)
     with replacing(path) as file:
         (write_ply if kind == ".ply" else write_obj)(file, mesh, frame)
     return [Path(path)]
@@ -80,7 +77,7 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
         file.write("".join([f"f {a} {b} {c}\n" for a, b, c in rows]).encode())
 
 
-def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
+def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     """GLB, and NAME.glb.json, which names the offset. Colours are linear, as glTF has them.
 
     Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore.
@@ -88,53 +85,28 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     Raises:
         BadInput: More than 4 GiB.
     """
-    places = frame.to_file(mesh.vertices).astype("<f4")
-    parts = [places.tobytes(), mesh.faces.astype("<u4").tobytes()]
-    views = [{"target": 34962, "byteStride": 12}, {"target": 34963}]
-    accessors = [
-        {"componentType": 5126, "type": "VEC3", "min": places.min(0).tolist(), "max": places.max(0).tolist()},
-        {"componentType": 5125, "type": "SCALAR"},
-    ]
-    counts, attributes = [len(places), mesh.faces.size], {"POSITION": 0}
-    if mesh.colors is not None:
-        parts.append(linear_colors(mesh.colors).tobytes())
-        views.append({"target": 34962, "byteStride": 8})
-        accessors.append({"componentType": SHORT, "normalized": True, "type": "VEC4"})
-        counts.append(len(places))
-        attributes["COLOR_0"] = 2
+    places, faces, count, blocks = frame.to_file(mesh.vertices).astype("<f4"), mesh.faces, len(mesh.vertices), Blocks()
+    view = blocks.add(places.nbytes, places.tobytes, target=VERTICES, byteStride=12)
+    ends = {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
+    attributes = {"POSITION": blocks.accessor(view, count=count, componentType=FLOAT, type="VEC3", **ends)}
+    view = blocks.add(4 * faces.size, lambda: faces.astype("<u4").tobytes(), target=INDICES)
+    indices = blocks.accessor(view, count=faces.size, componentType=INT, type="SCALAR")
+    if (colors := mesh.colors) is not None:
+        view = blocks.add(8 * count, lambda: linear_colors(colors).tobytes(), target=VERTICES, byteStride=8)
+        about = {"componentType": SHORT, "normalized": True, "type": "VEC4"}
+        attributes["COLOR_0"] = blocks.accessor(view, count=count, **about)
     for name, each in in_files(mesh, frame).items():
-        attributes[f"_{name.upper()}"] = len(parts)
-        parts.append(each.tobytes())
-        views.append({"target": 34962, "byteStride": 4})
-        accessors.append({"componentType": FLOAT, "type": "SCALAR"})
-        counts.append(len(places))
-    starts = np.cumsum([0, *map(len, parts)]).tolist()
-    node = {"mesh": 0} | ({"matrix": UP} if frame.crs else {})
+        view = blocks.add(4 * count, each.tobytes, target=VERTICES, byteStride=4)
+        attributes[f"_{name.upper()}"] = blocks.accessor(view, count=count, componentType=FLOAT, type="SCALAR")
     document = {
         "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [{"mesh": 0} | ({"matrix": UP} if frame.crs else {})],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1, "material": 0}]}],
-        "buffers": [{"byteLength": starts[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": starts[at], "byteLength": len(part), **views[at]}
-            for at, part in enumerate(parts)
-        ],
-        "accessors": [{"bufferView": at, "count": counts[at], **kind} for at, kind in enumerate(accessors)],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + starts[-1]
-    if total > MOST_BYTES:
-        raise BadInput(f"{path}: {len(mesh.faces):,} triangles take {total} bytes; a GLB file has at most {MOST_BYTES}")
-    with replacing(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, total))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
-        for part in parts:
-            file.write(part)
+    write_glb(path, document, blocks, "simplify the mesh, with --triangles", spaced=True)
     beside = Path(f"{path}.json")
     up = "y: the file turns z up to y up" if frame.crs else "as in the input"
     write_json(beside, {"offset": list(frame.shift), "metres_per_unit": frame.metres, "crs": frame.crs, "up": up})

@@ -19,7 +19,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.delaunay import EDGES, crossing
 from surfkit.mesh.field import Field, vertex_colors
-from surfkit.raster.footprints import rotations
+from surfkit.scene.rotations import rotations
 
 TRIANGLES = (
     (), (0, 1, 2), (0, 4, 3), (1, 2, 4, 1, 4, 3), (1, 3, 5), (0, 5, 2, 0, 3, 5), (0, 4, 5, 0, 5, 1), (2, 4, 5),

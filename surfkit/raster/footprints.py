@@ -14,6 +14,7 @@ from torch import Tensor
 
 from surfkit.raster.api import ALPHA_MIN, CUTOFF, EDGE_ON, MIN_FOOTPRINT, Splats
 from surfkit.scene.camera import Camera
+from surfkit.scene.rotations import rotations
 
 ANTIALIAS_FLOOR = 2.5e-5
 LOW_PASS_SIGMA = 3.0
@@ -55,18 +56,6 @@ def footprints(splats: Splats, camera: Camera, near: float) -> Footprints:
     if splats.kind == "surfel":
         return surfels(splats, camera, near)
     return (along_rays if splats.geometry == "ray" else gaussians)(splats, camera, near)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotations of (N, 4) quaternions wxyz of any length."""
-    quats = quats / quats.detach().abs().amax(1, keepdim=True)  # lest the squares leave the range
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:

@@ -8,9 +8,9 @@ from torch import Tensor
 from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, Splats
-from surfkit.raster.footprints import rotations
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
+from surfkit.scene.rotations import rotations
 
 PIECE = 1 << 22
 """Pairs of a point and a splat that the reference evaluates at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 from urllib.parse import unquote
@@ -9,11 +10,10 @@ from urllib.parse import unquote
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.readers.camera_files import numbers
-from surfkit.readers.geocentric import LOCAL, PROJECTED
-from surfkit.readers.wkt import Node, parse_wkt
-from surfkit.scene.crs import axes_of
+from surfkit.scene.crs import axes_of, code_in, from_wkt, in_plan, metres_of
 
-LENGTH = ("UNIT", "LENGTHUNIT")
+UNIT = re.compile(r"UNIT\s*\[", re.IGNORECASE)
+"""A unit in well-known text; where there is none, pyproj takes metres."""
 
 
 def photo_names(paths: Sequence[str]) -> list[str]:
@@ -38,7 +38,7 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
     """The coordinate reference system of a definition, and metres per unit of it.
 
     Raises:
-        BadInput: It is in degrees, in which a rotation says nothing, or about the Earth's centre.
+        BadInput: It is none, in degrees, in which a rotation says nothing, or about the Earth's centre.
     """
     degrees = f"{where} is in degrees; export in a projected or a local coordinate system"
     if text.startswith("ENU:"):
@@ -54,23 +54,14 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
         except BadInput as error:
             raise BadInput(f"{where}: {error}; or export in local coordinates") from error
     if "[" in text:
-        node = parse_wkt(where, text)
-        flat_node = node if node.keyword in PROJECTED else node.child(*PROJECTED)
-        if flat_node is not None:
-            return flat_node.code or text, _metres(flat_node)
-        if node.keyword not in (*LOCAL, "ENGINEERINGCRS"):
+        given = in_plan(from_wkt(where, text))
+        if given.is_projected:
+            return code_in(given) or text, metres_of(given)
+        if not given.is_engineering:
             raise BadInput(degrees)
-        return None, _metres(node)
+        return None, metres_of(given) if UNIT.search(text) else None
     if text.upper().replace(" ", "") in ("WGS84", "WGS1984"):
         raise BadInput(degrees)
     if "local" not in text.lower():
         emit(Warned(f"{where} is not understood: coordinates are those of the file"))
     return None, None
-
-
-def _metres(node: Node) -> float | None:
-    """Metres per unit of a system, from its text; None where that does not say."""
-    axis = node.child("AXIS")
-    unit = node.child(*LENGTH) or (axis.child(*LENGTH) if axis is not None else None)
-    metres = unit.number(1) if unit is not None else None
-    return metres if metres and 0 < metres < 1e6 else None

@@ -6,17 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.core.optional import needed
-from surfkit.readers.georeference import POLAR, Similarity, zone_of
-from surfkit.readers.wkt import Node, parse_wkt
-from surfkit.scene.crs import exact
+from surfkit.readers.georeference import Similarity
+from surfkit.scene.crs import POLAR, code_in, exact, from_wkt, in_plan, zone_of
 from surfkit.scene.earth import AXIS, FLATTENING, to_ecef, utm
 
-GEOGRAPHIC, PROJECTED = ("GEOGCS", "GEOGCRS", "BASEGEOGCRS", "GEODCRS", "BASEGEODCRS"), ("PROJCS", "PROJCRS")
-VERTICAL, LOCAL = ("VERT_CS", "VERTCRS"), ("LOCAL_CS", "ENGCRS")
 WGS84 = ("EPSG:4326", "EPSG:4979")
 RADIUS_M = (6.2e6, 6.5e6)
 """Distances from the Earth's centre at which there are photographs."""
@@ -60,14 +58,17 @@ def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
         centres: (V, 3) of the cameras, metres from the Earth's centre.
 
     Raises:
-        BadInput: It is no such text, or pyproj is needed and does not know it.
+        BadInput: It is no such text.
     """
-    whole = parse_wkt(where, text)
-    if whole.keyword in LOCAL:
+    whole = from_wkt(where, text)
+    if whole.is_engineering:
         return None
-    flat = whole if whole.keyword in (*GEOGRAPHIC, *PROJECTED) else whole.child(*PROJECTED, *GEOGRAPHIC)
-    if flat is None:
-        raise BadInput(f"{where}: {whole.keyword} is no projected, geographic or local coordinate reference system")
+    flat = in_plan(whole)
+    if not (flat.is_geographic or flat.is_projected):
+        raise BadInput(
+            f"{where}: {flat.name!r} is a {flat.type_name}, and no projected, geographic or local one; choose such a "
+            "coordinate reference system, and export again"
+        )
     middle = centres.mean(0)
     if not RADIUS_M[0] < np.linalg.norm(middle) < RADIUS_M[1]:
         emit(
@@ -76,10 +77,9 @@ def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
             )
         )
         return None
-    if (vertical := whole.child(*VERTICAL)) is not None:
-        emit(Warned(f"{where}: heights are those above the ellipsoid, not {vertical.name!r}"))
-    geographic = flat if flat.keyword in GEOGRAPHIC else flat.child(*GEOGRAPHIC)
-    axis, flattening = _ellipsoid(where, geographic)
+    if whole.is_compound:
+        emit(Warned(f"{where}: heights are those above the ellipsoid, not {whole.sub_crs_list[1].name!r}"))
+    axis, flattening = _ellipsoid(where, flat)
     degrees = geodetic(middle[None], axis, flattening)[0]
     crs, unit, on_map = _projection(where, text, flat, degrees)
 
@@ -155,34 +155,33 @@ def warn_of_bend(where: str, name: str, move: Similarity, metres: float, convert
         )
 
 
-def _ellipsoid(where: str, geographic: Node | None) -> tuple[float, float]:
+def _ellipsoid(where: str, flat: CRS) -> tuple[float, float]:
     """Its semi-major axis, metres, and flattening."""
-    datum = geographic.child("DATUM", "ENSEMBLE", "TRF") if geographic is not None else None
-    found = datum.child("SPHEROID", "ELLIPSOID") if datum is not None else None
-    axis, inverse = (found.number(1), found.number(2)) if found is not None else (None, None)
-    if axis is None or inverse is None or not (6e6 < axis < 7e6 and (inverse == 0 or 100 < inverse < 1000)):
-        raise BadInput(f"{where}: no ellipsoid in its coordinate reference system; choose another, and export again")
+    axis, inverse = flat.ellipsoid.semi_major_metre, flat.ellipsoid.inverse_flattening
+    if not (6e6 < axis < 7e6 and (inverse == 0 or 100 < inverse < 1000)):
+        raise BadInput(
+            f"{where}: {flat.name!r} has an ellipsoid of {axis:g} m and a flattening of 1 : {inverse:g}, which is not "
+            "the Earth's; choose another coordinate reference system, and export again"
+        )
     return axis, 1 / inverse if inverse else 0.0
 
 
-def _projection(where: str, text: str, flat: Node, at: np.ndarray) -> tuple[str, float, OnMap]:
+def _projection(where: str, text: str, flat: CRS, at: np.ndarray) -> tuple[str, float, OnMap]:
     """The coordinate reference system of the map, metres per unit of it, and what brings degrees to it."""
-    code, zone = flat.code, zone_of(flat.code or "")
-    if flat.keyword in GEOGRAPHIC:
+    code = code_in(flat)
+    zone = zone_of(code or "")
+    if flat.is_geographic:
         if abs(at[0]) > POLAR:
             raise BadInput(f"{where}: degrees at latitude {at[0]:.1f}, where UTM ends; choose a projected system")
         zone = (int((at[1] + 180) // 6) % 60 + 1, bool(at[0] < 0))
     utm_crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}" if zone is not None else None
-    if utm_crs and (flat.keyword in PROJECTED or code in WGS84):
+    if utm_crs and (flat.is_projected or code in WGS84):
         return utm_crs, 1.0, lambda lat, lon: np.array([utm(*pair, *zone) for pair in zip(lat, lon, strict=True)])
     return _by_pyproj(where, text, code, utm_crs)
 
 
 def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tuple[str, float, OnMap]:
     """The same, of degrees on the datum of a text, or of the code in it, onto another system or its own."""
-    with needed("pyproj", f"the coordinate reference system {code or 'of ' + where}"):
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import CRSError, ProjError
     try:
         given = CRS(code or text)
         given = given.sub_crs_list[0] if given.is_compound else given
@@ -192,7 +191,7 @@ def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tup
             emit(Warned(f"{where}: the shift from its datum to {onto} is not known; places may be some 100 m off"))
             known = Transformer.from_crs(degrees, target, always_xy=True)
         unit = float(target.axis_info[0].unit_conversion_factor)
-    except (CRSError, ProjError, AttributeError, IndexError) as error:
+    except (ProjError, AttributeError, IndexError) as error:
         said = " ".join(str(error).split())[:200]
         raise BadInput(f"{where}: pyproj does not know its coordinate reference system: {said}") from error
     name = onto or code or " ".join(target.to_wkt().split())

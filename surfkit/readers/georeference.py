@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +13,13 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
+from surfkit.readers.systems import system_of
+from surfkit.scene.crs import BESIDE, POLAR, zone_of
 from surfkit.scene.earth import AXIS, FLATTENING, utm
 
-POLAR, BESIDE = 84.0, 30.0
-"""Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
 MOST_M = 1e8
 """No coordinate on Earth is larger, metres."""
 FOLDER = "odm_georeferencing"
-ZONES = (r"WGS ?84 / UTM zone (\d+)([NS])", r"WGS84 UTM (\d+)([NS])", r"\+proj=utm.*\+zone=(\d+)()")
-"""How OpenDroneMap writes a zone of UTM, in coords.txt and in proj.txt."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +75,12 @@ def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: f
     local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
     lines = _lines(root / FOLDER / "coords.txt")
     texts = [*lines[:1], *_lines(root / FOLDER / "proj.txt")[:1]]
-    zone = next((found for text in texts for found in [zone_of(text)] if found), None)
+    zone = next(filter(None, map(_zone, texts)), None)
     if zone is None or abs(latitude) > POLAR:
         if texts:
             emit(
                 Warned(
-                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM at {latitude:.6f}, {longitude:.6f}: "
+                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM on WGS 84 at {latitude:.6f}, {longitude:.6f}: "
                     "coordinates are metres east, north and up of there"
                 )
             )
@@ -140,14 +137,12 @@ def _lines(path: Path) -> list[str]:
         raise BadInput(f"{path}: cannot be read as text; run OpenDroneMap again, or delete it") from error
 
 
-def zone_of(text: str) -> tuple[int, bool] | None:
-    """Number of a zone of UTM, and whether it is south of the equator."""
-    for pattern in ZONES:
-        if (found := re.match(pattern, text)) and 1 <= int(found[1]) <= 60:
-            return int(found[1]), found[2] == "S" or "+south" in text
-    if (found := re.fullmatch(r"EPSG:32([67])(\d\d)", text)) and 1 <= int(found[2]) <= 60:
-        return int(found[2]), found[1] == "7"
-    return None
+def _zone(text: str) -> tuple[int, bool] | None:
+    """The zone of UTM on WGS 84 that a line of OpenDroneMap names; None where it names another system, or none."""
+    try:
+        return zone_of(system_of(text).crs)
+    except BadInput:
+        return None
 
 
 def _offset(path: Path, lines: list[str]) -> tuple[float, float, float] | None:

@@ -18,12 +18,13 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.export.glb import WIDTHS
 from surfkit.readers.camera_files import numbers
 from surfkit.readers.capture import shorten
+from surfkit.scene.rotations import numpy_rotations
 
 KINDS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Types of glTF's components."""
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From glTF's frame to that of the project."""
 MATCHES = "OPF_mesh_primitive_matches"
@@ -151,12 +152,10 @@ class _File:
         if "matrix" in node:
             return numbers(f"{where}: matrix", node["matrix"], 16).reshape(4, 4).T
         x, y, z, w = numbers(f"{where}: rotation", node.get("rotation", [0, 0, 0, 1]), 4)
-        length = x * x + y * y + z * z + w * w
-        if length == 0:
+        if not any((x, y, z, w)):
             raise BadInput(f"{where}: rotation: a quaternion of zeros; {AGAIN}")
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         move = np.eye(4)
-        move[:3, :3] += 2 / length * (w * cross + cross @ cross)
+        move[:3, :3] = numpy_rotations(np.array([[w, x, y, z]]))[0]
         move[:3, :3] *= numbers(f"{where}: scale", node.get("scale", [1, 1, 1]), 3)
         move[:3, 3] = numbers(f"{where}: translation", node.get("translation", [0, 0, 0]), 3)
         return move

@@ -21,7 +21,7 @@ from surfkit.readers.camera_files import numbers, one_file, photographs, pose_at
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.transforms import points
-from surfkit.readers.wkt import parse_wkt
+from surfkit.scene.crs import code_in, from_wkt, in_plan, metres_of
 
 FOLDERS = ("", "params", "1_initial/params")
 """Where the files may lie."""
@@ -172,11 +172,9 @@ def _crs(path: Path) -> tuple[str | None, float | None]:
     if not path.is_file():
         return None, None
     text = " ".join(read_text(path).split())
-    node = parse_wkt(str(path), text)
-    flat = node if node.keyword == "PROJCS" else node.child("PROJCS")
-    if flat is None:
-        emit(Warned(f"{path}: {node.name!r} is no projected coordinate reference system, and is left out"))
+    given = from_wkt(str(path), text)
+    flat = in_plan(given)
+    if not flat.is_projected:
+        emit(Warned(f"{path}: {given.name!r} is no projected coordinate reference system, and is left out"))
         return None, None
-    unit = flat.child("UNIT")
-    metres = unit.number(1) if unit is not None else None
-    return flat.code or text, metres if metres and 0 < metres < 1e6 else None
+    return code_in(flat) or text, metres_of(flat)

@@ -20,11 +20,11 @@ from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.densify.trim import Trim
-from surfkit.evaluate.images.measure import psnr
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Rasterizer
+from surfkit.raster.psnr import psnr
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run
 from surfkit.run.method import splats_of, with_drawing

@@ -346,7 +346,7 @@ def write_files(
                 paths = write_mesh(run.out / f"{name}.{kind}", each, subject.frame)
             except BadInput as error:  # larger than such a file can be: hours of work are not to be lost
                 alone = kinds == [kind]
-                emit(Warned(f"{error}: {'PLY is written in its place' if alone else 'it is left out'}"))
+                emit(Warned(f"{error}; {'PLY is written in its place' if alone else 'it is left out'}"))
                 kinds += ["ply"] if alone else []
                 continue
             for path in paths:

@@ -14,15 +14,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pyproj import CRS, Geod, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
 
 from surfkit.core.check import BadInput
-from surfkit.core.optional import needed
 
 NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
 TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+lon_0={NUMBER} \+h_0={NUMBER}")
 EGM96 = "+5773"
 """What the code of a map ends with where heights are above sea level by EGM96, the geoid that receivers of GPS know."""
 UTM = re.compile(rf"EPSG:32([67])(0[1-9]|[1-5]\d|60)({re.escape(EGM96)})?", re.IGNORECASE)
+POLAR, BESIDE = 84.0, 30.0
+"""Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
 DEGREES = "EPSG:4326"
 UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
 """Short names of units of length, by those of EPSG."""
@@ -60,20 +65,55 @@ class Axes:
         return UNITS.get(self.unit, self.unit)
 
 
-def parsed(crs: str) -> Any:
+def parsed(crs: str) -> CRS:
     """The system as pyproj has it.
 
     Raises:
-        BadInput: pyproj is not installed, or does not know it.
+        BadInput: pyproj does not know it.
     """
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS
-        from pyproj.exceptions import ProjError
     try:
         return CRS(crs)
-    except ProjError as error:
+    except (ProjError, UnicodeEncodeError) as error:  # the latter of half a character, as JSON may have it
         said = " ".join(str(error).split())[:200].removeprefix(f"Invalid projection: {crs}: ")
         raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place it on Earth: {said}") from error
+
+
+def from_wkt(where: str, text: str) -> CRS:
+    """The system of a well-known text in a file.
+
+    Raises:
+        BadInput: It is none; names `where` it comes from.
+    """
+    try:
+        return CRS.from_wkt(text)
+    except (CRSError, UnicodeEncodeError) as error:
+        said = " ".join(str(error).rpartition("proj_create: ")[2].removesuffix(")").split())[:200]
+        raise BadInput(
+            f"{where}: no coordinate reference system that pyproj reads: {said}; export it again, in another one such "
+            "as UTM if that does not help"
+        ) from error
+
+
+def in_plan(crs: CRS) -> CRS:
+    """A system without its heights, and without the shift of datum (TOWGS84) that its text may have."""
+    flat = crs.sub_crs_list[0] if crs.is_compound else crs
+    return flat.source_crs if flat.is_bound else flat
+
+
+def code_in(crs: CRS) -> str | None:
+    """The code that a text itself names, such as "EPSG:32632"; None where it names none.
+
+    Not `CRS.to_epsg`, which looks for a system that is alike: it takes UTM on an unknown datum with the ellipsoid of
+    1924 for ED50, some 100 m away.
+    """
+    named = crs.to_json_dict().get("id")
+    return f"{named['authority']}:{named['code']}".upper() if named else None
+
+
+def metres_of(crs: CRS) -> float | None:
+    """Metres per unit of the first axis; None where that is no length."""
+    metres = crs.axis_info[0].unit_conversion_factor if crs.axis_info else 0.0
+    return metres if 0 < metres < 1e6 else None
 
 
 def axes_of(crs: str) -> Axes:
@@ -81,7 +121,7 @@ def axes_of(crs: str) -> Axes:
 
     Raises:
         BadInput: It is not one of easting and northing in a unit of length, or heights are in another unit than
-            those; or pyproj is needed and not installed, or does not know it.
+            those; or pyproj does not know it.
     """
     if is_plain(crs):
         return Axes(height_metres=1.0, height_unit="metre") if crs.endswith(EGM96) else Axes()
@@ -109,12 +149,18 @@ def axes_of(crs: str) -> Axes:
 
 def is_plain(crs: str) -> bool:
     """Whether it is a zone of UTM on WGS 84, with or without heights by EGM96, or a topocentric frame, in metres: they
-    need no pyproj, but for the heights of the geoid."""
+    are computed here, but for the heights of the geoid."""
     return bool(UTM.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
 
 
+def zone_of(crs: str) -> tuple[int, bool] | None:
+    """Number of a zone of UTM on WGS 84, and whether it is south of the equator; None for any other system."""
+    found = UTM.fullmatch(crs)
+    return (int(found[2]), found[1] == "7") if found and not found[3] else None
+
+
 def known_axes(crs: str) -> Axes | None:
-    """The same; None where it is none of a map with one unit, or pyproj is not there to tell."""
+    """The same; None where it is none of a map with one unit."""
     try:
         return axes_of(crs)
     except BadInput:
@@ -148,8 +194,6 @@ def scale_at(crs: str, place: np.ndarray) -> float:
     """
     if is_plain(crs):
         return 1.0
-    from pyproj import Geod
-
     steps = STEP_M / axes_of(crs).metres * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
     lon, lat = degrees_of(crs, np.asarray(place, np.float64)[:2] + steps)
     if not np.isfinite([lon, lat]).all():
@@ -160,8 +204,6 @@ def scale_at(crs: str, place: np.ndarray) -> float:
 
 def degrees_of(crs: str, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P,) longitudes and latitudes of (P, 2) eastings and northings, degrees on the datum of the system itself."""
-    from pyproj import Transformer
-
     flat = parsed(crs).to_2d()
     flat = flat.source_crs if flat.is_bound else flat
     own = flat.geodetic_crs.to_2d()
@@ -178,9 +220,6 @@ def exact(source: Any, target: Any) -> Any | None:
         source: A coordinate reference system, or what names one.
         target: Another one.
     """
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
-
     try:
         return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
     except ProjError:
@@ -199,10 +238,6 @@ def used_beyond(known: Any, lon: float, lat: float) -> bool:
 
 def missing(source: Any, target: Any, lon: float, lat: float) -> tuple[list[str], float]:
     """Grids that the best transformation at a place in degrees lacks, and how exact it is, metres (-1: not known)."""
-    from pyproj.aoi import AreaOfInterest
-    from pyproj.exceptions import ProjError
-    from pyproj.transformer import TransformerGroup
-
     area = AreaOfInterest(lon - 1e-3, max(lat - 1e-3, -90.0), lon + 1e-3, min(lat + 1e-3, 90.0))
     try:
         with warnings.catch_warnings():

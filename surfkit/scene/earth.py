@@ -74,7 +74,7 @@ class Site:
 
         Raises:
             BadInput: Its coordinates are no lengths of one unit, or the shift from its datum to WGS 84 is not known, or
-                pyproj is needed and not installed, or does not know it.
+                pyproj does not know it.
         """
         metres = axes_of(crs).metres
         convert, notes = on_earth(crs, origin, geoid)
@@ -119,8 +119,7 @@ def on_earth(crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> tuple[
             ellipsoid of its datum.
 
     Raises:
-        BadInput: The shift from its datum to WGS 84 is not known there, or pyproj is needed and not installed, or does
-            not know the system.
+        BadInput: The shift from its datum to WGS 84 is not known there, or pyproj does not know the system.
     """
     untold = (
         f"{crs} does not say what heights are above: they are taken as above the ellipsoid of its datum; where they "

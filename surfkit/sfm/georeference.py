@@ -10,8 +10,8 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.readers.georeference import BESIDE, POLAR, Similarity, zone_of
-from surfkit.scene.crs import DEGREES, axes_of, exact, parsed
+from surfkit.readers.georeference import Similarity
+from surfkit.scene.crs import BESIDE, DEGREES, POLAR, axes_of, exact, parsed, zone_of
 from surfkit.scene.earth import Site, utm
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.plausible import Hand
@@ -103,7 +103,7 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
         crs: Coordinate reference system, or "auto" for the zone of UTM.
 
     Raises:
-        BadInput: The coordinate reference system is not known, or is none of east, north and up, or pyproj is missing.
+        BadInput: The coordinate reference system is not known, or is none of east, north and up.
     """
     heights = positions[np.isfinite(positions[:, 2]), 2]
     plan = np.column_stack([positions[:, 0], _unbroken(positions[:, 1])])
@@ -133,7 +133,7 @@ def chart_about(crs: str, placed: np.ndarray) -> Chart:
 def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
     """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes. East and north that
     are not finite say that the map does not reach them; a height is not finite where the altitude is not known."""
-    zone = zone_of(chart.crs.upper())
+    zone = zone_of(chart.crs)
     if zone is not None:
         away = np.abs((positions[:, 1] - (6 * zone[0] - 183) + 180) % 360 - 180)
         reached = (np.abs(positions[:, 0]) <= POLAR) & (away < BESIDE)

@@ -15,11 +15,11 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
+from surfkit.readers.systems import system_of
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.plausible import FAR_M, HIGH_M, LOW_M, Hand
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
-from surfkit.sfm.systems import system_of
 
 FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""

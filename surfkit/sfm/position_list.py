@@ -12,8 +12,8 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
+from surfkit.readers.systems import WGS84_DEGREES, System, names_a_system, system_of
 from surfkit.sfm.exif import MOST_ERROR_M, Position
-from surfkit.sfm.systems import WGS84_DEGREES, System, names_a_system, system_of
 
 COLUMNS = {
     "name": "name label image imagename imagefile photo photograph photoname file filename sourcefile camera "

@@ -60,8 +60,8 @@ class Settings:
     """Coordinate reference system of --positions, where the file names none."""
 
     crs: str = "auto"
-    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is that of --positions or
-    geo.txt if it is a map, else the zone of UTM."""
+    """Coordinate reference system of the scene, such as EPSG:2180; auto is that of --positions or geo.txt if it
+    is a map, else the zone of UTM."""
 
     gcp: Path | None = None
     """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""

@@ -11,13 +11,13 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.readers.systems import covers
 from surfkit.scene.crs import EGM96, UTM, known_axes
 from surfkit.sfm.georeference import Chart, Level, Placement, Refused, centres_of, chart_of, place
 from surfkit.sfm.level import points_of, turn_upright, up_of
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.plausible import upside_down
 from surfkit.sfm.positions import Positions, no_letters
-from surfkit.sfm.systems import covers
 
 
 @dataclass(frozen=True)

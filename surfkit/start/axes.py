@@ -18,6 +18,7 @@ from surfkit.export.models import in_scene, read_sound
 from surfkit.export.table import SplatTable
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel, primitive_of
+from surfkit.raster.psnr import psnr
 from surfkit.raster.select import select
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
@@ -89,8 +90,7 @@ def _decibels(table: SplatTable, scene: Scene) -> dict[Axes, float]:
         draws, total = drawn_by(primitive, rasterizer), 0.0
         for view, photo in photos:
             maps = draws.render(model.splats, view.camera, model.near, geometry=False, distortion=False).maps
-            error = (maps.color.clamp(0, 1) - photo).square().mean().clamp_min(1e-10)
-            total += float(-10 * error.log10())
+            total += psnr(maps.color, photo)
         found[name] = total / max(len(photos), 1)
     return found
 

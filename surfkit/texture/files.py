@@ -1,7 +1,7 @@
 """A textured mesh as OBJ and GLB.
 
 Sources: glTF 2.0, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and its extension KHR_materials_unlit:
-photographs have the light of the day in them, and are to be shown as they are.
+what it shows is shown as it is.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from surfkit.core.version import own_version
-from surfkit.export.glb import VERTICES, Blocks, write_glb
+from surfkit.export.glb import FLOAT, INDICES, INT, UNLIT, VERTICES, Blocks, write_glb
 from surfkit.mesh.base import Mesh
 from surfkit.texture.candidates import NONE
 from surfkit.texture.charts import Atlas
@@ -22,10 +22,7 @@ from surfkit.texture.fill import Pictures
 
 CHUNK = 1 << 20
 """Rows that are written at once."""
-ELEMENTS = 34963
-"""Target of a buffer view of indices."""
 LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
-UNLIT = "KHR_materials_unlit"
 SUFFIX = {"jpeg": "jpg", "png": "png"}
 
 Place = Callable[[np.ndarray], np.ndarray]
@@ -148,7 +145,7 @@ def write_textured_glb(
         "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP}],
         "images": images,
     }
-    write_glb(path, document, blocks)
+    write_glb(path, document, blocks, "use the format tiles3d")
     return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)]).astype(np.float64)
 
 
@@ -156,11 +153,12 @@ def _add_part(blocks: Blocks, xyz: np.ndarray, part: Part) -> dict[str, Any]:
     """The primitive of a page, with (V, 3) float32 coordinates of its vertices, whose bytes are added to a file."""
     count = len(xyz)
     view = blocks.add(xyz.nbytes, xyz.tobytes, target=VERTICES)
-    position = blocks.accessor(view, count, "VEC3", min=xyz.min(0).tolist(), max=xyz.max(0).tolist())
+    ends = {"min": xyz.min(0).tolist(), "max": xyz.max(0).tolist()}
+    position = blocks.accessor(view, componentType=FLOAT, count=count, type="VEC3", **ends)
     view = blocks.add(8 * count, part.uv.astype("<f4").tobytes, target=VERTICES)
-    texcoord = blocks.accessor(view, count, "VEC2")
-    view = blocks.add(4 * part.faces.size, part.faces.astype("<u4").tobytes, target=ELEMENTS)
-    indices = blocks.accessor(view, part.faces.size, "SCALAR", 5125)
+    texcoord = blocks.accessor(view, componentType=FLOAT, count=count, type="VEC2")
+    view = blocks.add(4 * part.faces.size, part.faces.astype("<u4").tobytes, target=INDICES)
+    indices = blocks.accessor(view, componentType=INT, count=part.faces.size, type="SCALAR")
     return {"attributes": {"POSITION": position, "TEXCOORD_0": texcoord}, "indices": indices}
 
 

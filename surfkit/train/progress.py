@@ -8,14 +8,13 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
 
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
-from torch import Tensor
 
 from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.cuda.memory import peak_gpu_bytes
+from surfkit.raster.psnr import psnr
 from surfkit.train.stage import Done
 
 PLAIN_EVERY_S = 5.0
@@ -135,9 +134,3 @@ class Mean:
         """Take in a value."""
         self.count += 1
         self.value += (value - self.value) * max(1 - MEMORY, 1 / self.count)
-
-
-def psnr(image: Tensor, photo: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB, of images (3, H, W) with peak 1; the first is clamped."""
-    error = torch.mean((image.clamp(0, 1) - photo) ** 2)
-    return float(-10 * torch.log10(error.clamp_min(1e-10)))

@@ -13,8 +13,8 @@ from surfkit.evaluate.images.pictures import RAMP
 from surfkit.export.table import SplatTable
 from surfkit.lod.tree import LodTree
 from surfkit.mesh.base import Mesh
-from surfkit.primitives.base import rotated
 from surfkit.primitives.init import SH_C0
+from surfkit.scene.rotations import numpy_rotations
 
 Colors = Literal["as trained", "height", "normal", "block"]
 PALETTE = np.array(
@@ -92,8 +92,7 @@ def drawn(table: SplatTable, rgb: np.ndarray | None = None, unit: float | None =
 
 def axes_of(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotation matrices of (N, 4) quaternions of any length: columns are the axes of a splat."""
-    unit = torch.nn.functional.normalize(quats.float(), dim=1)
-    return torch.stack([rotated(axis.expand(len(unit), 3), unit) for axis in torch.eye(3)], dim=2)
+    return torch.from_numpy(numpy_rotations(quats.numpy())).float()
 
 
 def normals_of(table: SplatTable, up: np.ndarray) -> np.ndarray:

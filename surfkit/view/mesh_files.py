@@ -14,10 +14,10 @@ from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.place import Place, place_of, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.export.bits import from_linear
+from surfkit.export.glb import BYTE
 
 SRGB_WRITERS = ("surfkit ", "https://github.com/mikedh/trimesh")
 """How `asset.generator` begins in files of programs that write bytes of sRGB to COLOR_0, as surfkit once did."""
-BYTE = 5121
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 
 

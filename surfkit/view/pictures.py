@@ -13,6 +13,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.evaluate.images.pictures import RAMP, colour_normal
 from surfkit.raster.api import Maps
+from surfkit.raster.psnr import psnr
 from surfkit.render.frames import depth_of, shown, spread
 from surfkit.scene.photos import read_draft, view_photo
 from surfkit.scene.scene import Frame, View
@@ -67,14 +68,13 @@ def error_picture(maps: Maps, photo: Tensor) -> tuple[np.ndarray, str]:
         maps: With colours.
         photo: (3, H, W) in [0, 1].
     """
-    difference = maps.color.detach().cpu().float().clamp(0, 1) - photo
-    error = difference.abs().mean(0)
+    color = maps.color.detach().cpu().float().clamp(0, 1)
+    error = (color - photo).abs().mean(0)
     steps = np.linspace(0, WORST, len(RAMP))
     colors = np.stack([np.interp(error.numpy(), steps, RAMP[:, i]) for i in range(3)], axis=2)
-    squared = float(difference.square().mean())
-    psnr = "infinite" if squared == 0 else f"{-10 * np.log10(squared):.2f} dB"
+    ratio = f"{psnr(color, photo):.2f} dB" if error.any() else "infinite"
     ends = f"dark is 0, the palest {WORST:.0%} and more"
-    told = f"|render - photograph|: {ends}; mean {float(error.mean()):.1%}, PSNR {psnr}"
+    told = f"|render - photograph|: {ends}; mean {float(error.mean()):.1%}, PSNR {ratio}"
     return np.round(colors * 255).astype(np.uint8), told
 
 

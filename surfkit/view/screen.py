@@ -14,6 +14,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
+from surfkit.scene.rotations import numpy_quaternions, numpy_rotations
 from surfkit.view.by_view import Eye
 
 if TYPE_CHECKING:
@@ -183,9 +184,7 @@ def ray_through(camera: viser.CameraHandle, x: float, y: float) -> tuple[np.ndar
 
 def pose_of(camera: viser.CameraHandle) -> np.ndarray:
     """(4, 4) float64 world_to_camera of a browser's camera, local frame."""
-    from viser import transforms
-
-    turn = transforms.SO3(np.asarray(camera.wxyz, np.float64)).as_matrix().T
+    turn = numpy_rotations(np.asarray(camera.wxyz)[None])[0].T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, -turn @ (np.asarray(camera.position, np.float64) / WORLD)
     return pose
@@ -193,9 +192,7 @@ def pose_of(camera: viser.CameraHandle) -> np.ndarray:
 
 def quaternion_of(pose: np.ndarray) -> np.ndarray:
     """(4,) wxyz of the rotation from the axes of a camera to the world."""
-    from viser import transforms
-
-    return transforms.SO3.from_matrix(np.asarray(pose[:3, :3], np.float64).T).wxyz
+    return numpy_quaternions(np.asarray(pose[None, :3, :3]).transpose(0, 2, 1))[0]
 
 
 def stand_at(client: viser.ClientHandle, pose: np.ndarray, distance: float) -> None:

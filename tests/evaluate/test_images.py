@@ -8,8 +8,9 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.images import measure
-from surfkit.evaluate.images.measure import evaluate_views, frames_per_second, psnr
+from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
 from surfkit.raster.api import Maps
+from surfkit.raster.psnr import psnr
 from surfkit.testing.synthetic import Flight, photograph
 
 SYNTHETIC = photograph(Flight(views=5, width=32, height=24, points=20))

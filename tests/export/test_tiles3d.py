@@ -4,9 +4,9 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pyproj
 import pytest
 import torch
-from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
@@ -113,7 +113,7 @@ def test_splats_lie_on_earth_where_proj_has_them(tmp_path):
     ],
 )
 def test_heights_above_sea_level_are_raised_by_the_geoid_or_told_of(tmp_path, monkeypatch, crs, geoid, height, said):
-    pyproj, told = needs("pyproj"), []
+    told = []
     monkeypatch.setattr("surfkit.export.tileset.emit", told.append)
     table = on_the_map(splat_table(count=20))
     Tiles3D(compress="none", geoid=geoid).write(tmp_path / "t", table, replace(MAPPED, crs=crs))
@@ -124,7 +124,6 @@ def test_heights_above_sea_level_are_raised_by_the_geoid_or_told_of(tmp_path, mo
 
 
 def test_what_has_no_place_on_earth_leaves_nothing_behind(tmp_path):
-    needs("pyproj")
     table = on_the_map(splat_table(count=20))
     for frame, said in (
         (replace(MAPPED, crs="EPSG:3857"), "1 m to the east or north is"),

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.lod import MergedLevels
 from surfkit.lod.cut import cut, depth_for
 from surfkit.lod.merge import blocks
-from surfkit.lod.moments import Shapes, merged_model, quaternions, rotations
+from surfkit.lod.moments import Shapes, merged_model
 from surfkit.lod.pairs import Alike, groups
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.init import seeds
@@ -19,6 +19,7 @@ from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import ALPHA_MAX, Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
+from surfkit.scene.rotations import numpy_rotations
 from surfkit.scene.scene import Cloud
 from surfkit.testing.inputs import lod_input
 
@@ -38,7 +39,7 @@ def random_model(primitive, count=6, seed=0, opacity=0.3):
 
 def moments(splats, weights):
     """Total opacity times area, mean and covariance of a mixture, written out point by point."""
-    turns = rotations(splats.quats.double().numpy())
+    turns = numpy_rotations(splats.quats.double().numpy())
     mass, mean = 0.0, np.zeros(3)
     total = weights.sum()
     for at in range(len(splats)):
@@ -103,19 +104,12 @@ def test_opaque_splats_in_one_place_stay_opaque():
     assert area == pytest.approx(2**0.5, rel=1e-4)
 
 
-def test_rotations_and_back():
-    quats = torch.nn.functional.normalize(torch.randn(20, 4, generator=torch.Generator().manual_seed(0)), dim=1)
-    turns = rotations(3 * quats.double().numpy())
-    assert np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(turns), 1)
-    assert np.allclose(rotations(quaternions(turns)), turns)
-
-
 def plane(side=16, gap=0.1):
     """Surfels of one colour on a tilted plane, a gap apart, and the plane's normal."""
     at = gap * torch.stack(torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij"), -1).view(-1, 2)
     primitive = Surfel2D(sh_degree=0)
     turn = torch.tensor([0.9, 0.3, -0.2, 0.1])
-    turns = torch.from_numpy(rotations(turn[None].double().numpy()))[0]
+    turns = torch.from_numpy(numpy_rotations(turn[None].double().numpy()))[0]
     xyz = at.double() @ turns[:, :2].T
     cloud = Cloud(
         xyz.float(), torch.full((len(xyz), 3), 200, dtype=torch.uint8), size=torch.full((len(xyz),), 0.7 * gap)
@@ -147,7 +141,7 @@ def test_a_plane_of_equal_surfels_stays_the_plane():
     for level, maps in zip(tree.levels[1:], drawn[1:], strict=True):
         heights = level.splats.means.double() @ normal
         assert float(heights.max() - heights.min()) < 1e-6
-        axes = torch.from_numpy(rotations(level.splats.quats.double().numpy()))[:, :, 2]
+        axes = torch.from_numpy(numpy_rotations(level.splats.quats.double().numpy()))[:, :, 2]
         assert float((axes @ normal).abs().min()) > 1 - 1e-6
         assert float(maps.alpha[inner].min()) > 0.85, "no holes"
         assert float((maps.expected_depth() - 3.0)[inner].abs().max()) < 1e-4

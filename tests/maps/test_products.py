@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pyproj
 import pytest
 import torch
 from needs import needs
@@ -241,7 +242,6 @@ def test_lengths_that_a_map_stretches_a_little_are_told_of(tmp_path, monkeypatch
     for crs, at in (("EPSG:3035", (4_321_000.0, 3_210_000.0)), ("EPSG:3995", place)):
         map_crs(Frame(np.array([*at, 0.0]), 0.01, 1.0, crs))
     longer = float(told[0].text.split("are ")[1].split(" times")[0])
-    pyproj = needs("pyproj")
     lon, lat = pyproj.Transformer.from_crs("EPSG:3995", "EPSG:4326", always_xy=True).transform(*place)
     scale = pyproj.Proj("EPSG:3995").get_factors(lon, lat).areal_scale ** 0.5
     assert len(told) == 1 and longer == pytest.approx(scale, abs=2e-3)

@@ -1,6 +1,7 @@
 """Files of meshes, read back by another library."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -157,6 +158,27 @@ def test_values_are_properties_of_ply(tmp_path):
     back = local_mesh(ours, UTM)
     assert back.values["error"] == pytest.approx(mesh.values["error"], rel=1e-6) and len(back.values) == 2
     assert np.array_equal(back.values["views"], mesh.values["views"]) and back.values["error"].dtype == np.float32
+
+
+def test_a_glb_file_byte_for_byte(tmp_path, monkeypatch):
+    """Put together by hand; programs that compare files of two versions see no difference."""
+    monkeypatch.setattr("surfkit.mesh.files.own_version", lambda: "1.2.3")
+    corners, path = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32), tmp_path / "mesh.glb"
+    write_mesh(path, Mesh(corners, np.array([[0, 1, 2]], np.int32)), Frame(np.zeros(3), 1.0))
+    text = (
+        b'{"asset": {"version": "2.0", "generator": "surfkit 1.2.3"}, "scene": 0, "scenes": [{"nodes": [0]}], '
+        b'"nodes": [{"mesh": 0}], "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, '
+        b'"doubleSided": true}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, '
+        b'"material": 0}]}], "buffers": [{"byteLength": 48}], "bufferViews": [{"buffer": 0, "byteOffset": 0, '
+        b'"byteLength": 36, "target": 34962, "byteStride": 12}, {"buffer": 0, "byteOffset": 36, "byteLength": 12, '
+        b'"target": 34963}], "accessors": [{"bufferView": 0, "count": 3, "componentType": 5126, "type": "VEC3", '
+        b'"min": [0.0, 0.0, 0.0], "max": [1.0, 2.0, 0.0]}, {"bufferView": 1, "count": 3, "componentType": 5125, '
+        b'"type": "SCALAR"}]}'
+    )
+    text += b" " * (-len(text) % 4)
+    data = struct.pack("<9f3I", *corners.ravel(), 0, 1, 2)
+    chunks = struct.pack("<I", len(text)) + b"JSON" + text + struct.pack("<I", len(data)) + b"BIN\0" + data
+    assert path.read_bytes() == b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
 def test_values_are_attributes_of_glb(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import Warned
+from surfkit.export import glb
 from surfkit.mesh import files
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.simplify import simplified
@@ -26,25 +27,25 @@ TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
     ("formats", "written"), [(["glb"], ["mesh.ply"]), (["glb", "obj"], ["mesh.obj"]), (["ply", "glb"], ["mesh.ply"])]
 )
 def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, written):
-    monkeypatch.setattr(files, "MOST_BYTES", 500)
+    monkeypatch.setattr(glb, "MOST_BYTES", 500)
     told = []
     monkeypatch.setattr(delivering, "emit", told.append)
     run, subject = SimpleNamespace(out=tmp_path), SimpleNamespace(frame=Frame(np.zeros(3), 1.0))
     found = list(write_files(run, [("mesh", TRIANGLE)], MeshOutput(formats=tuple(formats)), subject))
     assert [path.name for path in found] == written == [path.name for path in tmp_path.iterdir()]
     (warned,) = [event.text for event in told if isinstance(event, Warned)]
-    assert "mesh.glb: 1 triangles" in warned and "at most 500" in warned
+    assert "mesh.glb: " in warned and "at most 500: simplify the mesh" in warned
     assert ("in its place" in warned) == (formats == ["glb"])
 
 
 def test_the_length_of_a_glb_file_is_known_before_it_is_begun(tmp_path, monkeypatch):
     path = tmp_path / "mesh.glb"
-    files.write_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
-    monkeypatch.setattr(files, "MOST_BYTES", path.stat().st_size)
-    files.write_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
-    monkeypatch.setattr(files, "MOST_BYTES", path.stat().st_size - 1)
-    with pytest.raises(BadInput, match=f"take {path.stat().st_size} bytes"):
-        files.write_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+    files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size)
+    files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size - 1)
+    with pytest.raises(BadInput, match=f"mesh.glb: {path.stat().st_size} bytes"):
+        files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
 
 
 @pytest.mark.parametrize("part", ["", "compressed"])

@@ -3,11 +3,11 @@
 import math
 
 import numpy as np
+import pyproj
 import pytest
-from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.scene.crs import axes_of, exact, refuse_other_unit, scale_at
+from surfkit.scene.crs import axes_of, code_in, exact, from_wkt, in_plan, metres_of, refuse_other_unit, scale_at
 from surfkit.scene.lengths import unit_of
 from surfkit.scene.scene import Frame
 
@@ -34,7 +34,6 @@ NEW_YORK = np.array([980_000.0, 200_000.0, 50.0])
     ],
 )
 def test_units(crs, metres, symbol):
-    needs("pyproj")
     assert axes_of(crs).metres == pytest.approx(metres, rel=1e-12)
     assert unit_of(Frame(np.zeros(3), 1.0, metres, crs)) == symbol
 
@@ -55,7 +54,6 @@ def test_units(crs, metres, symbol):
     ],
 )
 def test_what_is_no_map_of_one_unit_is_refused_in_one_line(crs, said):
-    needs("pyproj")
     with pytest.raises(BadInput, match=said) as caught:
         axes_of(crs)
     assert crs in str(caught.value) and "\n" not in str(caught.value)
@@ -74,7 +72,6 @@ def test_what_is_no_map_of_one_unit_is_refused_in_one_line(crs, said):
     ],
 )
 def test_lengths_on_the_ground(crs, place, scale):
-    needs("pyproj")
     assert scale_at(crs, np.array([*place, 10.0])) == pytest.approx(scale, rel=2e-3 if scale == 0.5 else 2e-4)
 
 
@@ -91,7 +88,6 @@ def test_lengths_on_the_ground(crs, place, scale):
     ],
 )
 def test_a_unit_that_contradicts_the_system_is_refused(crs, metres, agrees):
-    needs("pyproj")
     place = np.array([-8_238_000.0, 5_070_000.0, 0.0]) if crs == "EPSG:3857" else NEW_YORK
     if agrees:
         refuse_other_unit(crs, metres, place)
@@ -102,7 +98,58 @@ def test_a_unit_that_contradicts_the_system_is_refused(crs, metres, agrees):
 
 def test_no_transformation_is_a_guess():
     """PROJ leaves the shift of an unknown datum out, and says so in a description only."""
-    pyproj = needs("pyproj")
     unknown = "+proj=utm +zone=33 +ellps=bessel +type=crs"
     assert math.isfinite(pyproj.Transformer.from_crs(unknown, "EPSG:4326", always_xy=True).transform(5e5, 5.8e6)[0])
     assert exact(unknown, "EPSG:4326") is None and exact("EPSG:31467", "EPSG:4326") is not None
+
+
+@pytest.mark.parametrize("number", [2056, 2263, 5514, 25833, 31467, 32633])
+@pytest.mark.parametrize("version", ["WKT1_GDAL", "WKT1_ESRI", "WKT2_2019"])
+def test_what_a_text_says_of_a_map(number, version):
+    """The code is that in the text: ESRI writes none."""
+    known = pyproj.CRS(f"EPSG:{number}")
+    found = from_wkt("a.prj", known.to_wkt(version))
+    assert code_in(found) == (None if version == "WKT1_ESRI" else f"EPSG:{number}")
+    assert metres_of(found) == pytest.approx(known.axis_info[0].unit_conversion_factor, rel=1e-12)
+
+
+def test_a_text_with_heights_or_a_shift_of_datum_has_the_code_of_its_map():
+    heights = pyproj.CRS("EPSG:25833+7837")
+    shifted = pyproj.CRS("EPSG:31467").to_wkt("WKT1_GDAL")
+    shifted = shifted.replace(']],AUTHORITY["EPSG","6314"]', "]],TOWGS84[598,74,418,0,0,0,0]")
+    assert "TOWGS84" in shifted and pyproj.CRS(shifted).is_bound and code_in(pyproj.CRS(shifted)) is None
+    assert code_in(in_plan(from_wkt("a", shifted))) == "EPSG:31467"
+    assert code_in(in_plan(from_wkt("a", heights.to_wkt("WKT1_GDAL")))) == "EPSG:25833"
+    esri = in_plan(from_wkt("a", heights.to_wkt("WKT1_ESRI")))  # a map and heights, one after the other
+    assert esri.is_projected and not esri.is_compound
+
+
+def test_no_code_is_guessed_from_what_is_alike():
+    alike = pyproj.CRS("+proj=utm +zone=33 +ellps=intl")
+    assert alike.to_epsg() == 23033, "ED50, which is 100 m away"
+    assert code_in(alike) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("x", "Invalid WKT string: x;"),
+        ("PROJCS[", "missing ];"),
+        ('PROJCS["a",UNIT["metre",1],AUTHORITY["EPSG","32632"]]', "missing CONVERSION node;"),
+        ("PROJCS[" * 1000, "too many nesting levels;"),
+        ('PROJCS["\ud800"]', "'utf-8' codec can't encode character '\\ud800' in position 8: surrogates not allowed;"),
+    ],
+)
+def test_a_text_that_is_none_is_refused_in_one_line(text, why):
+    with pytest.raises(BadInput) as caught:
+        from_wkt("a.prj", text)
+    assert str(caught.value).startswith(
+        f"a.prj: no coordinate reference system that pyproj reads: {why} export it again"
+    )
+
+
+def test_a_unit_that_is_no_length_is_not_known():
+    feet = pyproj.CRS("EPSG:2222").to_wkt("WKT1_GDAL")
+    assert metres_of(from_wkt("a", feet)) == 0.3048
+    for wrong in ("0", "-1", "1e7"):
+        assert metres_of(from_wkt("a", feet.replace('UNIT["foot",0.3048', f'UNIT["foot",{wrong}'))) is None

@@ -1,6 +1,7 @@
 """Places on Earth, against PROJ."""
 
 import numpy as np
+import pyproj
 import pytest
 from needs import needs
 
@@ -24,7 +25,6 @@ def test_utm_lies_on_earth_where_proj_has_it(crs, place, wanted):
 
 @pytest.mark.parametrize("crs", ["EPSG:32634", "EPSG:32756", "EPSG:32601"])
 def test_any_place_in_a_zone_is_that_of_proj(crs):
-    pyproj = needs("pyproj")
     draw = np.random.default_rng(0)
     places = draw.uniform([2e5, 1e5, -100], [8e5, 9e6, 5000], (200, 3))
     known = pyproj.Transformer.from_crs(pyproj.CRS(crs).to_3d(), "EPSG:4978", always_xy=True)
@@ -73,21 +73,13 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
     ],
 )
 def test_what_has_no_place_is_refused_in_one_line(crs, text):
-    needs("pyproj")
     with pytest.raises(BadInput, match=text) as caught:
         Site.at(crs, np.array([1e6, 6e6, 430.0]))
     assert "\n" not in str(caught.value)
 
 
 def test_other_systems_are_placed_by_pyproj():
-    needs("pyproj")
     assert Site.at("EPSG:25832", np.array([5e5, 5.3e6, 0])).unit == pytest.approx(1.0003, abs=1e-4)
-
-
-def test_without_pyproj_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
-    with pytest.raises(BadInput, match=r"EPSG:25832.*pip install 'surfkit\[crs\]'"):
-        to_ecef("EPSG:25832", np.array([[5e5, 5.3e6, 0]]))
 
 
 PLACE = np.array([451_234.5, 5_873_456.25, 37.0])  # 8.273207 east, 53.008438 north
@@ -96,7 +88,7 @@ BERLIN = np.array([[4_590_000.0, 5_820_000.0, 50.0]])
 
 def ellipsoidal(ecef):
     """Longitude, latitude and height above the ellipsoid, by PROJ."""
-    return needs("pyproj").Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*np.ravel(ecef))
+    return pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*np.ravel(ecef))
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:25832+7837", "EPSG:32632+5773"])
@@ -111,7 +103,6 @@ def test_heights_above_a_geoid_that_is_given(tmp_path, crs):
 
 def test_a_geoid_that_proj_has_is_used_without_a_word(tmp_path):
     """The system names a grid that is there; PROJ itself gives the height."""
-    pyproj = needs("pyproj")
     text = f"+proj=utm +zone=32 +datum=WGS84 +geoidgrids={write_gtx(tmp_path / 'g.gtx')} +type=crs"
     convert, notes = on_earth(text, PLACE)
     wanted = pyproj.Transformer.from_crs(text, "EPSG:4979", always_xy=True).transform(*PLACE)
@@ -129,7 +120,6 @@ def test_a_geoid_that_proj_has_is_used_without_a_word(tmp_path):
 )
 def test_a_geoid_that_is_not_installed_is_named(crs, grid):
     """PROJ leaves the height as it is, and says so in the description of its transformation only."""
-    needs("pyproj")
     convert, notes = on_earth(crs, PLACE)
     height = ellipsoidal(convert(PLACE[None]))[2]
     if crs.startswith("EPSG") and not notes:  # a machine that has the grid
@@ -140,7 +130,6 @@ def test_a_geoid_that_is_not_installed_is_named(crs, grid):
 
 
 def test_without_a_vertical_part_heights_are_above_the_ellipsoid_of_the_datum_and_a_note_says_so():
-    pyproj = needs("pyproj")
     for crs, metres, place in (("EPSG:25832", 1, PLACE), ("EPSG:2263", 1200 / 3937, [980_000.0, 200_000.0, 50.0])):
         convert, notes = on_earth(crs, np.array(place))
         known = pyproj.Transformer.from_crs(pyproj.CRS(crs).to_3d(), "EPSG:4979", always_xy=True)
@@ -152,7 +141,6 @@ def test_without_a_vertical_part_heights_are_above_the_ellipsoid_of_the_datum_an
 
 def test_a_datum_that_is_placed_roughly_only_is_told():
     """Without its grid, PROJ brings DHDN to WGS 84 within 2 m there; far from Germany by any shift that it knows."""
-    needs("pyproj")
     notes = on_earth("EPSG:31468", BERLIN[0], geoid_of("40"))[1]
     if notes:  # else the grid is installed here
         assert "EPSG:31468 is placed on Earth within 2 m; for 1 m PROJ needs the grid de_adv_BETA2007.tif" in notes[0]

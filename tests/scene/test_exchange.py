@@ -16,7 +16,6 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import observations, read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
-from tests.needs import needs
 
 from .exchange import blocks_exchange, opf, polycam, record3d, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES, realitycapture
@@ -72,7 +71,11 @@ def test_tie_points_of_blocks_keep_their_tracks(tmp_path):
 
 
 LOCAL_CS = 'LOCAL_CS["Local",UNIT["metre",1]]'
-FEET = 'PROJCS["Feet",GEOGCS["WGS 84",DATUM["D",SPHEROID["S",6378137,298.25]]],UNIT["US survey foot",0.3048006096]]'
+FEET = (
+    'PROJCS["Feet",GEOGCS["WGS 84",DATUM["D",SPHEROID["S",6378137,298.25]],PRIMEM["Greenwich",0],UNIT["degree",'
+    '0.0174532925199433]],PROJECTION["Transverse_Mercator"],PARAMETER["central_meridian",9],UNIT["US survey foot",'
+    "0.3048006096]]"
+)
 ENU = "+proj=topocentric +ellps=WGS84 +lat_0=39.97523 +lon_0=-83.00678 +h_0=0.0"
 
 
@@ -82,8 +85,9 @@ ENU = "+proj=topocentric +ellps=WGS84 +lat_0=39.97523 +lon_0=-83.00678 +h_0=0.0"
         ("EPSG:32632", "EPSG:32632", 1.0),
         ("EPSG:32632+5773", "EPSG:32632", 1.0),
         ("ENU:39.97523,-83.00678", ENU, 1.0),
-        (FEET, FEET, 0.3048006096),
+        (FEET, FEET, pytest.approx(1200 / 3937, rel=1e-9)),
         (LOCAL_CS, None, 1.0),
+        ('LOCAL_CS["of no unit"]', None, None),
         ("Local Coordinates", None, None),
         (None, None, None),
     ],
@@ -181,8 +185,6 @@ def test_blocks_of_another_component_are_left_out(tmp_path):
     ],
 )
 def test_blocks_that_are_refused(tmp_path, given, said):
-    if "EPSG:4326" in given.values():
-        needs("pyproj")
     blocks_exchange(tmp_path, **given)
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
@@ -319,9 +321,17 @@ def test_sidecars_in_the_folder_of_the_data_set(tmp_path):
 
 UTM16 = (  # as the specification has it
     'PROJCRS["WGS 84 / UTM zone 16N",\n BASEGEOGCRS["WGS 84",ENSEMBLE["World Geodetic System 1984 ensemble",\n'
+    'MEMBER["World Geodetic System 1984 (Transit)"],MEMBER["World Geodetic System 1984 (G1762)"],'
     'ELLIPSOID["WGS 84",6378137,298.257223563,LENGTHUNIT["metre",1]],ENSEMBLEACCURACY[2.0]],ID["EPSG",4326]],\n'
-    'CONVERSION["UTM zone 16N",METHOD["Transverse Mercator",ID["EPSG",9807]]],CS[Cartesian,2],'
+    'CONVERSION["UTM zone 16N",METHOD["Transverse Mercator",ID["EPSG",9807]],'
+    'PARAMETER["Longitude of natural origin",-87],PARAMETER["False easting",500000]],CS[Cartesian,2],'
     'AXIS["(E)",east,ORDER[1],LENGTHUNIT["metre",1]],AXIS["(N)",north,ORDER[2],LENGTHUNIT["metre",1]],ID["EPSG",32616]]'
+)
+
+
+SITE = (
+    'ENGINEERINGCRS["Site",ENGINEERINGDATUM["Corner"],CS[Cartesian,2],AXIS["x",north],AXIS["y",east],'
+    'LENGTHUNIT["metre",1.0]]'
 )
 
 
@@ -331,7 +341,7 @@ UTM16 = (  # as the specification has it
         ({"definition": UTM16}, "EPSG:32616", 1.0),
         ({"definition": "EPSG:32616+EPSG:5773"}, "EPSG:32616", 1.0),
         ({"definition": UTM16, "scale": (3.0, 3.0, 1.0)}, None, 1 / 3),
-        ({"definition": 'ENGINEERINGCRS["Site",AXIS["x",north],LENGTHUNIT["metre",1.0]]', "swap": True}, None, 1.0),
+        ({"definition": SITE, "swap": True}, None, 1.0),
     ],
 )
 def test_opf_on_the_map(tmp_path, given, crs, metres):

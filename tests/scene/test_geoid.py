@@ -1,6 +1,7 @@
 """The height of the geoid, from grids and numbers, against PROJ's own interpolation and a plane."""
 
 import numpy as np
+import pyproj
 import pytest
 from needs import needs
 
@@ -18,7 +19,6 @@ def test_a_number_is_the_height_everywhere():
 
 def test_a_gtx_file_gives_what_proj_makes_of_it(tmp_path):
     needs("rasterio")
-    pyproj = needs("pyproj")
     path = write_gtx(tmp_path / "own geoid.gtx", values=lambda a, b: plane(a, b) + np.sin(3 * a) * np.cos(5 * b))
     found = geoid_of(str(path))(LATITUDE, LONGITUDE)
     steps = f'+step +proj=vgridshift +grids="{path}" +multiplier=1'
@@ -37,7 +37,7 @@ def test_grids_of_the_world_begin_where_they_like(tmp_path, west):
 
 def test_a_grid_in_metres_of_a_map(tmp_path):
     """As geodetic surveys of some countries give theirs: in their own projection."""
-    rasterio, pyproj = needs("rasterio"), needs("pyproj")
+    rasterio = needs("rasterio")
     east, north = 400_500 + 1000.0 * np.arange(120), 5_880_500 - 1000.0 * np.arange(100)
     values = 30 + 1e-5 * (east[None] - 450_000) + 2e-5 * (north[:, None] - 5_830_000)
     place = {"crs": "EPSG:25832", "transform": rasterio.Affine(1000, 0, 400_000, 0, -1000, 5_881_000)}

@@ -99,6 +99,9 @@ def test_moving_changes_no_pixel(tmp_path):
     np.testing.assert_allclose(new[:3, :3] @ new[:3, :3].T, np.eye(3), atol=1e-12)
 
 
+ENU = "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"
+
+
 @pytest.mark.parametrize(
     ("text", "longitude", "crs"),
     [
@@ -107,14 +110,15 @@ def test_moving_changes_no_pixel(tmp_path):
         ("+proj=utm +zone=7 +south +datum=WGS84\n1 2\n", -140, "EPSG:32707"),
         ("WGS84 UTM 1N\n1 2\n", 179.9, "EPSG:32601"),
         ("EPSG:32632\n1 2\n", 8.9, "EPSG:32632"),
-        ("EPSG:2056\n1 2\n", 8.9, "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
-        ("", 8.9, "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
+        ("EPSG:2056\n1 2\n", 8.9, ENU),
+        ("+proj=utm +zone=32 +ellps=intl\n1 2\n", 8.9, ENU),
+        ("", 8.9, ENU),
     ],
 )
 def test_zones_as_opendronemap_writes_them(tmp_path, text, longitude, crs):
     with collect_notes() as notes:
         assert project(tmp_path, text, REFERENCE | {"longitude": longitude}).crs == crs
-    assert ("is no zone of UTM" in "".join(notes.texts)) == text.startswith("EPSG:2056")
+    assert ("is no zone of UTM on WGS 84" in "".join(notes.texts)) == (crs == ENU and text != "")
 
 
 def test_without_gps_there_is_no_place(tmp_path):

@@ -1,8 +1,8 @@
 """Reconstructions on the map: zones, systems, wrong positions, and what determines no place."""
 
 import numpy as np
+import pyproj
 import pytest
-from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
@@ -105,8 +105,6 @@ def test_a_receiver_that_gave_one_position_only_determines_nothing(count):
 @pytest.mark.parametrize("crs", ["auto", "EPSG:2180"])
 @pytest.mark.parametrize("wrong", [(90.0, 0.0, 10.0), (0.0, -75.0, 10.0), (-52.0, -164.0, 10.0)])
 def test_a_position_beyond_the_map_is_named_and_left_out(crs, wrong, capsys):
-    if crs != "auto":
-        needs("pyproj")
     onto = grid()
     shots, photos = survey(onto)
     photos[7] = Photo("7.jpg", (0, 0), exif=Exif(position=wrong))
@@ -139,7 +137,6 @@ def test_the_zone_of_utm(place, zone):
 
 
 def test_other_systems_agree_with_proj():
-    pyproj = needs("pyproj")
     positions = np.array([[52.75, 16.87, 120.0], [52.751, 16.873, 118.0]])
     known = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:2180", always_xy=True)
     wanted = np.stack(known.transform(positions[:, 1], positions[:, 0]), 1)
@@ -164,13 +161,11 @@ def test_other_systems_agree_with_proj():
     ],
 )
 def test_systems_that_will_not_do(crs, said):
-    needs("pyproj")
     with pytest.raises(BadInput, match=said):
         chart_of(np.array([[52.0, 16.0, 100.0]]), crs)
 
 
 def test_a_group_without_positions_is_refused_on_every_map():
-    needs("pyproj")
     shots, _ = survey(grid(5))
     for crs in ("EPSG:32633", "EPSG:2180"):
         found = place(shots, [Photo(name, (0, 0)) for name in shots], Chart(crs, (0.0, 0.0, 0.0)))

@@ -3,8 +3,8 @@
 import re
 
 import numpy as np
+import pyproj
 import pytest
-from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
@@ -95,7 +95,6 @@ def test_a_checkpoint_has_no_say_and_a_wrong_point_is_found(tmp_path):
 
 
 def test_degrees_come_to_utm(tmp_path):
-    pyproj = needs("pyproj")
     back = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
     lines = ["EPSG:4326"]
     for at, place in enumerate(PLACES[:4] + OFFSET):
@@ -119,8 +118,6 @@ def test_degrees_come_to_utm(tmp_path):
     ],
 )
 def test_other_systems_are_not_taken_for_utm_on_wgs84(tmp_path, first, crs, metres):
-    if crs is None:
-        needs("pyproj")
     ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", SIZES)
     assert ground.chart.crs == (crs or first) and ground.chart.metres == pytest.approx(metres, rel=1e-5)
 

@@ -1,8 +1,8 @@
 """Positions in files: geo.txt of OpenDroneMap, and tables as other programs write them."""
 
 import numpy as np
+import pyproj
 import pytest
-from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.run.notes import collect_notes
@@ -58,7 +58,6 @@ def test_forms(listed, text, crs):
 
 
 def test_well_known_text_is_left_to_pyproj(listed):
-    pyproj = needs("pyproj")
     found = listed(f"#CoordinateSystem: {pyproj.CRS('EPSG:2180').to_wkt('WKT1_GDAL')}\na.jpg,350000,520000,99\n")
     wanted = pyproj.Transformer.from_crs("EPSG:2180", "EPSG:4326", always_xy=True).transform(350000, 520000)
     assert found.positions["a.jpg"] == pytest.approx((wanted[1], wanted[0], 99), abs=1e-9) and found.crs == "EPSG:2180"
@@ -118,8 +117,6 @@ def test_several_systems(listed):
     ],
 )  # fmt: skip
 def test_what_will_not_do(listed, text, crs, said):
-    if "no system" in text:
-        needs("pyproj")
     with pytest.raises(BadInput, match=said) as raised:
         listed(text, crs)
     assert "\n" not in str(raised.value)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
@@ -74,7 +73,6 @@ def test_without_both_letters_half_a_turn_is_left_open_unless_a_system_decides()
     assert "W" in found.reason.split("S 151.19")[0], "north-west, half a turn from south-east"
     found, said = decided(photographs(""), "EPSG:32756")
     assert isinstance(found, Placement) and "S 151.19" in said[0]
-    needs("pyproj")
     found, _ = decided(photographs(""), "EPSG:28356")  # GDA94 / MGA zone 56
     assert isinstance(found, Placement) and found.chart.crs == "EPSG:28356"
     with pytest.raises(BadInput, match="--crs EPSG:2180 is not meant for where the photographs are"):
@@ -114,7 +112,6 @@ def test_few_altitudes_place_in_plan_and_enough_place_in_space():
 
 
 def test_a_list_in_feet_is_placed_on_another_map():
-    needs("pyproj")
     with collect_notes() as notes:
         (found,) = readings(Positions(photographs(), "EPSG:2263"), "auto")
     assert found.chart.crs == "EPSG:32756" and "listed in EPSG:2263, which a scene cannot be in" in notes.texts[0]

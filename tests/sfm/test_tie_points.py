@@ -19,7 +19,9 @@ POSES = {f"view {at}.jpg": pose for at, pose in enumerate(arc(5))}
 OFFSET = np.array([512_000.0, 5_800_000.0, 90.0])
 QUICK = ("--max-features", "1500")
 UTM33 = (
-    'PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84",DATUM["WGS 84",SPHEROID["WGS 84",6378137,298.257223563]]],'
+    'PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84",DATUM["WGS 84",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["central_meridian",15],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
     'UNIT["metre",1],AUTHORITY["EPSG","32633"]]'
 )
 

@@ -4,7 +4,7 @@ import torch
 from rich.console import Console
 
 from surfkit.raster.api import Maps
-from surfkit.train.progress import Display, Mean, clock, outer, psnr
+from surfkit.train.progress import Display, Mean, clock, outer
 from surfkit.train.stage import Done
 
 
@@ -14,11 +14,6 @@ class Shown:
 
 def done(index: int) -> Done:
     return Done(index, {"l1": 0.25, "ssim": 0.25}, 12_345, Maps(color=torch.full((3, 4, 4), 0.1)), Shown())
-
-
-def test_psnr_of_a_known_error():
-    assert abs(psnr(torch.full((3, 4, 4), 0.1), torch.zeros(3, 4, 4)) - 20) < 1e-4
-    assert psnr(torch.full((3, 4, 4), 7.0), torch.ones(3, 4, 4)) == 100
 
 
 def test_clock():

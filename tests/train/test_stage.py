@@ -17,8 +17,8 @@ from surfkit.losses.surface import NormalConsistency
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.edit import Edit
+from surfkit.raster.psnr import psnr
 from surfkit.train.faults import Diverged
-from surfkit.train.progress import psnr
 from surfkit.train.stage import Stage
 
 QUIET = Stage(steps=40, densify=None, sh_every=10)

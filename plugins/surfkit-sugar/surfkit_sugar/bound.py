@@ -29,8 +29,9 @@ from surfkit import (
 )
 from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.primitives.init import SH_C0
+from surfkit.scene.rotations import quaternions
 from surfkit_sugar.density import gathered
-from surfkit_sugar.triangles import SLIVER, corners, ellipses, frames, packed, pairs, quaternions, turned
+from surfkit_sugar.triangles import SLIVER, corners, ellipses, frames, packed, pairs, turned
 
 MOST = 1 << 24
 """Rows are kept as float32 numbers, which are whole up to here."""

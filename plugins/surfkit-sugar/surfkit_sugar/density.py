@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surfkit import Splats
-from surfkit.raster.footprints import rotations
+from surfkit.scene.rotations import rotations
 
 THICKNESS = 0.1
 """Third scale of surfels, as a share of the smaller of their two: a disc without thickness has no density."""

@@ -44,24 +44,6 @@ def turned(frame: Tensor, turn: Tensor) -> Tensor:
     return torch.stack([cosine * x + sine * y, cosine * y - sine * x, normal], 2)
 
 
-def quaternions(turns: Tensor) -> Tensor:
-    """(M, 4) quaternions wxyz of (M, 3, 3) rotations, of any length; differentiable everywhere.
-
-    4 q_i q_j is linear in the entries of the rotation; of these four multiples of q, the longest is taken.
-    """
-    xx, yy, zz = turns.diagonal(dim1=1, dim2=2).unbind(1)
-    (yx, zx), (xy, zy), (xz, yz) = turns[:, [1, 2], 0].T, turns[:, [0, 2], 1].T, turns[:, [0, 1], 2].T
-    table = [
-        [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
-        [zy - yz, 1 + xx - yy - zz, yx + xy, xz + zx],
-        [xz - zx, yx + xy, 1 - xx + yy - zz, zy + yz],
-        [yx - xy, xz + zx, zy + yz, 1 - xx - yy + zz],
-    ]
-    multiples = torch.stack([torch.stack(row, 1) for row in table], 1)
-    longest = multiples.diagonal(dim1=1, dim2=2).argmax(1)
-    return multiples.gather(1, longest[:, None, None].expand(-1, 1, 4))[:, 0]
-
-
 def packed(rows: int) -> tuple[Tensor, float]:
     """The largest equal circles that lie in `rows` rows in an equilateral triangle of side 1.
 

@@ -12,8 +12,7 @@ import torch
 from surfkit_sugar import REFINED, AdjacentNormals, BindToMesh, BoundMesh, LevelSetPoisson, MeshBound
 from surfkit_sugar.bind import colors_near
 from surfkit_sugar.bound import sound
-from surfkit_sugar.triangles import ellipses, frames, packed, pairs, quaternions
-from torch.nn.functional import normalize
+from surfkit_sugar.triangles import ellipses, frames, packed, pairs
 
 from surfkit import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, components, evolve, hookimpl
 from surfkit.blocks.schedule import Compute
@@ -25,9 +24,9 @@ from surfkit.mesh.poisson import require_open3d
 from surfkit.mesh.simplify import require_simplification
 from surfkit.pipeline import load_run, run
 from surfkit.primitives import Surfel2D
-from surfkit.raster.footprints import rotations
 from surfkit.readers.data import Data
 from surfkit.run.stage import Intervals
+from surfkit.scene.rotations import rotations
 from surfkit.testing import check
 from surfkit.testing.inputs import mesh_input, splats
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -143,13 +142,6 @@ def test_gradients_by_vertices_are_those_of_finite_differences():
 
     leaves = [vertices.requires_grad_(), params["turn"].clone().requires_grad_()]
     assert torch.autograd.gradcheck(value, leaves, atol=1e-7)
-
-
-def test_quaternions_of_rotations_also_by_half_a_turn():
-    quats = normalize(torch.randn(200, 4, generator=draws(), dtype=torch.float64), dim=1)
-    quats = torch.cat([quats, torch.eye(4).double()])  # three of them turn by 180 degrees
-    found = normalize(quaternions(rotations(quats)), dim=1)
-    assert torch.allclose((found * quats).sum(1).abs(), torch.ones(204).double(), atol=1e-12)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3])

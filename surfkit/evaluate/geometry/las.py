@@ -113,14 +113,12 @@ def _notes(path: Path, header: Any) -> dict[str, str]:
     if not {type(vlr).__name__ for vlr in (*header.vlrs, *(header.evlrs or ()))} & RECORDS:
         return {}
     try:
-        with needed("pyproj", "the reference system"):
-            import pyproj  # noqa: F401 (what laspy reads it with)
         found = header.parse_crs()
         if found is None:
             raise BadInput("it is empty, or of no number of EPSG")
         flat = found.sub_crs_list[0] if found.is_compound else found
         number, unit = flat.to_epsg(), flat.axis_info[0].unit_conversion_factor if flat.axis_info else 1.0
-    except Exception as error:  # no pyproj, or what it does not know
+    except Exception as error:  # what pyproj does not know
         emit(Warned(f"{path}: coordinates are used without their reference system: {' '.join(str(error).split())}"))
         return {}
     return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and flat.is_projected else {}

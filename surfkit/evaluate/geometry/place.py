@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -131,17 +133,9 @@ def _rotation(path: Path, root: dict[str, Any]) -> np.ndarray:
 
 
 def same_plan(one: str, other: str) -> bool:
-    """Whether two coordinate reference systems are the same in plan, however they are spelt; heights do not count.
-
-    Where pyproj is not installed, the same text is the same system.
-    """
+    """Whether two coordinate reference systems are the same in plan, however they are spelt; heights do not count."""
     if one == other:
         return True
-    try:
-        from pyproj import CRS
-        from pyproj.exceptions import CRSError
-    except ImportError:
-        return False
     try:
         first, second = (CRS.from_user_input(each) for each in (one, other))
     except CRSError:

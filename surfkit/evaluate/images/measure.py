@@ -14,6 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
 from surfkit.evaluate.images.lpips import Perceptual
 from surfkit.raster.api import Maps
+from surfkit.raster.psnr import psnr
 from surfkit.raster.ssim import ssim, ssim_map
 from surfkit.scene.scene import View
 
@@ -23,28 +24,12 @@ Draw = Callable[[View], Maps]
 Show = Callable[[View, Tensor, Maps], None]
 """Gets a view, its photograph as (3, H, W) uint8 and its render."""
 
-SMALLEST = 1e-10
-"""Mean squared error at which PSNR ends, at 100 dB: equal images have a PSNR that JSON can hold."""
-
 
 class Pictures(Protocol):
     """Photographs by the position of their view."""
 
     def __getitem__(self, at: int, /) -> Tensor:
         """(3, H, W) uint8."""
-
-
-def psnr(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB for a peak of 1, at most 100.
-
-    Args:
-        render: (3, H, W), clamped to [0, 1] first, as a screen shows it.
-        photo: (3, H, W) in [0, 1].
-        mask: (H, W) bool, False where pixels do not count.
-    """
-    errors = (render.clamp(0, 1).double() - photo.double()).square()
-    error = errors.mean() if mask is None else errors[:, mask].mean()
-    return float(-10 * error.clamp_min(SMALLEST).log10())
 
 
 def mean_ssim(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:

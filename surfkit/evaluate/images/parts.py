@@ -10,8 +10,9 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
-from surfkit.evaluate.images.measure import Draw, mean_ssim, psnr
+from surfkit.evaluate.images.measure import Draw, mean_ssim
 from surfkit.evaluate.images.view_counts import ViewCounts
+from surfkit.raster.psnr import psnr
 
 Masks = dict[str, Tensor]
 """(H, W) bool of each part, by its name."""

@@ -1,4 +1,4 @@
-"""Coordinate reference systems as lists of positions and of ground control points name them."""
+"""Coordinate reference systems as OpenDroneMap, and lists of positions and of ground control points, name them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.core.optional import needed
-from surfkit.readers.georeference import BESIDE, POLAR, zone_of
-from surfkit.readers.wkt import parse_wkt
-from surfkit.scene.crs import exact
+from surfkit.scene.crs import BESIDE, POLAR, code_in, exact, from_wkt, zone_of
 from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
@@ -26,7 +25,8 @@ WKT = re.compile(r"[A-Z_]+\s*\[", re.IGNORECASE)
 PROJ = re.compile(
     r"\+(proj=(utm|longlat|latlong)|zone=\d+|south|(datum|ellps)=WGS84|towgs84=0(,0)*|units=m|no_defs|type=crs)(=True)?"
 )
-"""Words of PROJ that leave UTM and degrees on WGS 84, in metres; with any other they are left to pyproj."""
+"""Words of PROJ that leave UTM and degrees on WGS 84, in metres. For pyproj, their datum is not known where they name
+an ellipsoid only."""
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,14 @@ class System:
 
         Heights are those of the list, counted from what it counts them from; those that are not known are not finite,
         nor are latitude and longitude where the system does not reach.
-
-        Raises:
-            BadInput: pyproj is needed and not installed, or cannot tell.
         """
         if self.crs == WGS84_DEGREES:
             return xyz[:, [1, 0, 2]]
-        if self.crs.startswith("EPSG:") and (zone := zone_of(self.crs)):
+        if zone := zone_of(self.crs):
             found = np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
             away = np.abs(found[:, 1] - (6 * zone[0] - 183))
             found[~((np.abs(found[:, 0]) <= POLAR) & (away < BESIDE)), :2] = np.nan
             return found
-        with needed("pyproj", f"the coordinate reference system {self.crs}"):
-            from pyproj import CRS, Transformer
         given = CRS(self.crs)
         known = exact(given.to_2d(), WGS84_DEGREES)
         if known is None:
@@ -83,35 +78,28 @@ def system_of(text: str) -> System:
     """The system that a line names: a code of EPSG, "WGS84 UTM 33N", "WGS84", a text of PROJ or well-known text.
 
     Raises:
-        BadInput: It is none, or pyproj is needed and not installed.
+        BadInput: It is none.
     """
     text = text.strip().strip("'\"").strip()
     if found := UTM.fullmatch(text):
         return _utm(text, int(found[1]), (found[2] or "").upper())
-    if text.upper() in WGS84_NAMES:
-        return System(WGS84_DEGREES, True)
     if text.startswith("+") and all(map(PROJ.fullmatch, text.split())):
         words = {word.removesuffix("=True") for word in text.split()}
         if words & {"+proj=longlat", "+proj=latlong"}:
             return System(WGS84_DEGREES, True)
         if number := next((int(word.removeprefix("+zone=")) for word in words if word.startswith("+zone=")), None):
             return _utm(text, number, "S" if "+south" in words else "N")
-    named = parse_wkt("well-known text", text).code if WKT.match(text) else None
+    named = code_in(from_wkt("well-known text", text)) if WKT.match(text) else None
     if found := CODE.fullmatch(named or text):
         text = f"EPSG:{found[1]}"
-        if text == WGS84_DEGREES or zone_of(text):
-            return System(text, text == WGS84_DEGREES)
     return _by_pyproj(text)
 
 
 def covers(crs: str, latitude: float, longitude: float) -> bool:
     """Whether a system is meant for a place; True where it does not say what it is meant for."""
-    if zone := zone_of(crs.upper()):
+    if zone := zone_of(crs):
         away = abs((longitude - (6 * zone[0] - 183) + 180) % 360 - 180)
         return away < 6 and abs(latitude) <= POLAR and (latitude < 1 if zone[1] else latitude > -1)
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS
-        from pyproj.exceptions import ProjError
     try:
         area = CRS(crs).area_of_use
     except ProjError:
@@ -135,12 +123,9 @@ def _utm(text: str, number: int, letter: str) -> System:
 
 def _by_pyproj(text: str) -> System:
     shown = text if len(text) <= 60 else f"{text[:60]}..."
-    with needed("pyproj", f"the coordinate reference system {shown}"):
-        from pyproj import CRS
-        from pyproj.exceptions import ProjError
     try:
         found = CRS(text)
-    except ProjError as error:
+    except (ProjError, UnicodeEncodeError) as error:
         raise BadInput(
             f"{shown!r} is no coordinate reference system that pyproj knows; name one such as EPSG:32633, "
             "WGS84 UTM 33N or EPSG:4326"
