@@ -38,7 +38,7 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
 from surfkit.scene.vectors import unit
 from surfkit.train import checkpoint
-from surfkit.train.material import needs_normals
+from surfkit.train.data_cache import needs_normals
 from surfkit.train.stage import Stage, Trainer
 from surfkit.train.state import StageState
 

@@ -25,12 +25,12 @@ from surfkit.scene.memory import free_bytes
 from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import TrainingData
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
-from surfkit.train.material import TrainingData
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.progress import Display
-from surfkit.train.sparing import lowered
+from surfkit.train.retry_on_oom import lowered
 from surfkit.train.stage import Trainer
 from surfkit.train.state import StageState
 from surfkit.train.watch import Stopwatch, Watched, watched
@@ -81,7 +81,7 @@ class StageJob:
     rasterizer: Rasterizer
     intervals: Intervals
     given: TrainingData
-    meter: Meter
+    meter: MemoryMeter
     start: Callable[[torch.Generator], InitialModel]
     before: StageState | None = None
     frozen: Callable[[], InitialModel] | None = None
@@ -207,7 +207,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     return state
 
 
-def save(stage: RunStage, state: StageState, meter: Meter) -> None:
+def save(stage: RunStage, state: StageState, meter: MemoryMeter) -> None:
     """Write a checkpoint, and emit what the memory is used for."""
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
     state.peak_gpu_bytes = max(state.peak_gpu_bytes, peak_gpu_bytes())

@@ -31,15 +31,15 @@ from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
-from surfkit.train.cotangents import as_numbers, cotangents, pulled, regularizer_terms
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
+from surfkit.train.image_appearance import ImageAppearance, fresh_appearances
 from surfkit.train.in_view import InView
-from surfkit.train.look import Look, fresh_looks
+from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
+from surfkit.train.neighbour_selector import NeighbourSelector
 from surfkit.train.reads import maps_read
-from surfkit.train.rig import Rig
-from surfkit.train.seen import Seen
-from surfkit.train.sparing import sparing
+from surfkit.train.retry_on_oom import retry_on_oom
 from surfkit.train.state import StageState
+from surfkit.train.step import StepResult
 from surfkit.train.uploads import Pictures, Shown, Uploads
 from surfkit.train.views import Order, ViewContributions
 from surfkit.train.watch import Stopwatch
@@ -114,7 +114,7 @@ class Stage:
     def finished(self, state: StageState) -> Columns:
         """Raw parameters of the points as they leave the stage, in the colours of the mean photograph."""
         params = state.points.all_params()
-        return params if self.appearance is None else self.appearance.folded(state.looks["value"], params)
+        return params if self.appearance is None else self.appearance.folded(state.appearances["value"], params)
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Trainer:
         expect: Told the positions in the order in which they will be asked for, whenever a new order begins.
         owns: (N, 3) positions to (N,) bool: points elsewhere are neither copied nor split; None if all points may be.
         beside: Gives the positions of the views that may be second ones, best first, from the position of a view and
-            the depth that is rendered there; None finds them by the cameras (`Rig.neighbours`).
+            the depth that is rendered there; None finds them by the cameras (`NeighbourSelector.neighbours`).
         gpu_bytes: Photographs, masks and priors that may be kept on a GPU.
     """
 
@@ -169,7 +169,7 @@ class Trainer:
             )
         state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
-            state.looks = fresh_looks(self.stage.appearance, len(self.views))
+            state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
         state.move(self.rasterizer.where())
         return state
 
@@ -199,11 +199,11 @@ class Trainer:
         if state.index % OBSERVED_EVERY == 0:
             state.points = observe(self.primitive, state.points, self.views, self.stage.near)
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // self.stage.sh_every))
-        found = sparing(state, self.uploads, lambda: self.seen(state))
+        found = retry_on_oom(state, self.uploads, lambda: self.seen(state))
         self.learn(state, found)
         return Done(index, found.losses, len(state.points), found.render.maps, found.target)
 
-    def seen(self, state: StageState) -> Seen:
+    def seen(self, state: StageState) -> StepResult:
         """Render the next view, compare it with its photograph, and go back to the splats."""
         stage, index = self.stage, state.index + 1
         shown, target = self.target(state)
@@ -221,18 +221,20 @@ class Trainer:
         self.uploads.ahead(state.order, state.skipped)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
-        look = self.look(state, shown)
-        losses, total, chosen, by_look = cotangents(stage.losses, stage.signal, active, render.maps, compared, look)
+        appearance = self.appearance_of(state, shown)
+        given = active, render.maps, compared, appearance
+        losses, total, chosen, by_appearance = loss_gradients(stage.losses, stage.signal, *given)
         gradients = render.backward(total, chosen, stage.signal.absolute, len(shape))
-        return Seen(target, some, leaves, shape, splats, render, losses, gradients, look and (look, by_look))
+        learned = appearance and (appearance, by_appearance)
+        return StepResult(target, some, leaves, shape, splats, render, losses, gradients, learned)
 
-    def learn(self, state: StageState, found: Seen) -> None:
+    def learn(self, state: StageState, found: StepResult) -> None:
         """Change the points by what a step has seen."""
         stage, index, target, render = self.stage, state.index + 1, found.target, found.render
         state.whole = False
-        if found.look is not None:
-            look, by_look = found.look
-            look.learn(by_look)
+        if found.appearance is not None:
+            appearance, by_appearance = found.appearance
+            appearance.learn(by_appearance)
         seen = render.seen[: len(found.shape)]
         given = RegularizerInput(index, stage.steps, target, render.maps, seen, state.points.stat, found.leaves)
         terms = regularizer_terms(stage.regularizers, found.shape, given)
@@ -248,7 +250,7 @@ class Trainer:
             require_finite_values(index, target.view.name, state.points.all_params())
         state.points = fitted(self.primitive, state.points)
         if edit is not None:
-            state.points = sparing(state, self.uploads, lambda: self.edited(state, edit, index))
+            state.points = retry_on_oom(state, self.uploads, lambda: self.edited(state, edit, index))
         state.index, state.whole = index, True
 
     def in_view(self, state: StageState, camera: Camera) -> InView | None:
@@ -314,9 +316,9 @@ class Trainer:
         return None
 
     @cached_property
-    def rig(self) -> Rig:
+    def selector(self) -> NeighbourSelector:
         """The cameras of all views."""
-        return Rig.of([view.camera for view in self.views])
+        return NeighbourSelector.of([view.camera for view in self.views])
 
     def neighbour(self, state: StageState, splats: Splats, shown: int, maps: Maps) -> Neighbour | None:
         """One of the views that show best, from another side, what a view shows; None if none does.
@@ -324,7 +326,7 @@ class Trainer:
         Which one depends on what is rendered now and on the seed and number of the step, and on nothing else, so that
         a run which goes on has the same ones.
         """
-        found = (self.beside or self.rig.neighbours)(shown, maps.median)
+        found = (self.beside or self.selector.neighbours)(shown, maps.median)
         generator = torch.Generator().manual_seed(state.seed)
         first = int(torch.randint(max(1, len(found)), (), generator=generator))
         for at in (*found[first:], *found[:first]):
@@ -335,14 +337,14 @@ class Trainer:
             return Neighbour(self.views[at], shown.in_floats(), shape, shown.mask)
         return None
 
-    def look(self, state: StageState, shown: int) -> Look | None:
-        """The look of a photograph, if the stage learns any."""
+    def appearance_of(self, state: StageState, shown: int) -> ImageAppearance | None:
+        """The appearance of a photograph, if the stage learns any."""
         if self.stage.appearance is None:
             return None
         rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps) / 2**state.halvings
-        return Look(self.stage.appearance, state.looks, shown, rate)
+        return ImageAppearance(self.stage.appearance, state.appearances, shown, rate)
 
-    def facts(self, state: StageState, found: Seen) -> Step:
+    def facts(self, state: StageState, found: StepResult) -> Step:
         """What the policies are told about a step, and nothing about frozen points."""
         index, count, render, gradients = state.index + 1, len(found.shape), found.render, found.gradients
         signal, among_all = self.stage.signal, found.in_view.among_all if found.in_view else (lambda values: values)

@@ -40,8 +40,8 @@ from surfkit.run.stage import Intervals
 from surfkit.scene import memory
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
-from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Stage, Trainer
 
 STEPS = 12

@@ -22,7 +22,7 @@ from surfkit.report.status import status
 from surfkit.run import measure
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Trainer
 
 STEPS = 20

@@ -9,12 +9,12 @@ from torch import Tensor
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import InView
-from surfkit.train.look import Look
 
 
 @dataclass(frozen=True)
-class Seen:
+class StepResult:
     """What a step knows before it changes anything.
 
     Attributes:
@@ -26,7 +26,7 @@ class Seen:
         render: The view as drawn.
         losses: Weighted value of each loss.
         gradients: By the splats.
-        look: The look of the photograph, and the gradient by it, if the stage learns any.
+        appearance: That of the photograph, and the gradient by it, if the stage learns any.
     """
 
     target: Target
@@ -37,4 +37,4 @@ class Seen:
     render: Render
     losses: dict[str, float]
     gradients: Gradients
-    look: tuple[Look, Tensor | None] | None
+    appearance: tuple[ImageAppearance, Tensor | None] | None

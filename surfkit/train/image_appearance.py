@@ -1,4 +1,4 @@
-"""What a stage learns of the look of each photograph."""
+"""What a stage learns of the appearance of each photograph."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surfkit.primitives.points import Columns
 from surfkit.train.adam import update
 
 
-def fresh_looks(model: Appearance, count: int) -> Columns:
+def fresh_appearances(model: Appearance, count: int) -> Columns:
     """The numbers of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often."""
     value = model.begin(count)
     moments = {name: torch.zeros_like(value) for name in ("first", "second")}
@@ -20,25 +20,25 @@ def fresh_looks(model: Appearance, count: int) -> Columns:
 
 
 @dataclass
-class Look:
+class ImageAppearance:
     """One photograph's own numbers in one step.
 
     Attributes:
         model: What they mean.
-        looks: Of all photographs.
+        table: The numbers of all photographs (`fresh_appearances`).
         row: The photograph's.
         rate: The learning rate now.
         numbers: The photograph's, with which gradients can be taken.
     """
 
     model: Appearance
-    looks: Columns
+    table: Columns
     row: int
     rate: float
     numbers: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        self.numbers = self.looks["value"][self.row].clone().requires_grad_()
+        self.numbers = self.table["value"][self.row].clone().requires_grad_()
 
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
@@ -54,6 +54,6 @@ class Look:
         """Take this photograph's next step of Adam, if there is a gradient."""
         if grad is None:
             return
-        self.looks["shown"][self.row] += 1
-        value, first, second = (self.looks[name][self.row] for name in ("value", "first", "second"))
-        update(value, grad, first, second, self.rate, int(self.looks["shown"][self.row]))
+        self.table["shown"][self.row] += 1
+        value, first, second = (self.table[name][self.row] for name in ("value", "first", "second"))
+        update(value, grad, first, second, self.rate, int(self.table["shown"][self.row]))
