@@ -46,7 +46,8 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
-from surfkit.train.stage import Stage, StageState
+from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.run.context import RunContext
 
@@ -79,7 +80,7 @@ from surfkit.raster.select import select
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.run.stage import Intervals
 from surfkit.blocks.worker import Start

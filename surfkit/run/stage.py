@@ -27,12 +27,13 @@ from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import TrainingData
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
+from surfkit.train.in_view import with_frozen
 from surfkit.train.interrupt import graceful
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.progress import Display
 from surfkit.train.retry_on_oom import lowered
-from surfkit.train.stage import Trainer
 from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 from surfkit.train.watch import Stopwatch, Watched, watched
 
 CHECKPOINT_EVERY = 500
@@ -270,7 +271,7 @@ def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable
     def draw(view: View, geometry: bool) -> Maps:
         with job.meter.adding("pictures"):
             degree = state.sh_degree
-            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), degree), degree)
+            splats = with_frozen(trainer, state, at.primitive.activate(at.stage.finished(state), degree), degree)
             return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
 
     return draw

@@ -10,6 +10,8 @@ from torch import Tensor
 from surfkit.appearance.base import Appearance
 from surfkit.primitives.points import Columns
 from surfkit.train.adam import update
+from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
 
 
 def fresh_appearances(model: Appearance, count: int) -> Columns:
@@ -29,6 +31,7 @@ class ImageAppearance:
         row: The photograph's.
         rate: The learning rate now.
         numbers: The photograph's, with which gradients can be taken.
+        grad: The gradient by them; None before `backward`, and where no loss looks at colours.
     """
 
     model: Appearance
@@ -36,24 +39,32 @@ class ImageAppearance:
     row: int
     rate: float
     numbers: Tensor = field(init=False)
+    grad: Tensor | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.numbers = self.table["value"][self.row].clone().requires_grad_()
+
+    @classmethod
+    def of_step(cls, stage: Stage, state: StageState, at: int) -> ImageAppearance | None:
+        """That of photograph `at` in the coming step; None if the stage learns none."""
+        if stage.appearance is None:
+            return None
+        rate = stage.appearance.rate_at(state.index + 1, stage.steps) / 2**state.halvings
+        return cls(stage.appearance, state.appearances, at, rate)
 
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
         return self.model(self.numbers.to(color), color)
 
-    def gradient(self, losses: list[Tensor]) -> Tensor | None:
-        """That of the sum of losses, whose graph stays; None if none of them looks at colours."""
-        if not losses:
-            return None
-        return torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)[0]
+    def backward(self, losses: list[Tensor]) -> None:
+        """Find the gradient of the sum of losses, whose graph stays."""
+        if losses:
+            self.grad = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)[0]
 
-    def learn(self, grad: Tensor | None) -> None:
+    def learn(self) -> None:
         """Take this photograph's next step of Adam, if there is a gradient."""
-        if grad is None:
+        if self.grad is None:
             return
         self.table["shown"][self.row] += 1
         value, first, second = (self.table[name][self.row] for name in ("value", "first", "second"))
-        update(value, grad, first, second, self.rate, int(self.table["shown"][self.row]))
+        update(value, self.grad, first, second, self.rate, int(self.table["shown"][self.row]))

@@ -43,8 +43,11 @@ def loss_gradients(
     maps: Maps,
     target: Target,
     appearance: ImageAppearance | None,
-) -> tuple[dict[str, float], Maps, Maps | None, Tensor | None]:
-    """The weighted losses; their gradients by maps, also of those that `Signal.terms` names, and by the appearance."""
+) -> tuple[dict[str, float], Maps, Maps | None]:
+    """The weighted losses; their gradient by the maps, and that of those that `Signal.terms` names.
+
+    The appearance finds its own gradient.
+    """
     terms = signal.terms
     leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
     leafy = Maps(**leaves)
@@ -52,14 +55,15 @@ def loss_gradients(
     compared, target = ignoring(compared, target)
     values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
     numbers = as_numbers(values)
-    by_appearance = None if appearance is None else appearance.gradient(list(values.values()))
+    if appearance is not None:
+        appearance.backward(list(values.values()))
     if terms is None:
         total = gradient(list(values.values()), leaves)
-        return numbers, total, total if signal.absolute else None, by_appearance
+        return numbers, total, total if signal.absolute else None
     shared = appearance is not None or target.mask is not None  # what shows or hides pixels is before all losses
     chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
     others = gradient([value for name, value in values.items() if name not in terms], leaves)
-    return numbers, added(chosen, others), chosen, by_appearance
+    return numbers, added(chosen, others), chosen
 
 
 def regularizer_terms(

@@ -19,7 +19,9 @@ from surfkit.scene.scene import Cloud
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
 from surfkit.train.neighbour_selector import CHOICE, NeighbourSelector
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.next_view import neighbour
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 PAIRED = {
     "l1": L1(),
@@ -178,7 +180,7 @@ def test_all_good_neighbours_take_turns(world, every):
     maps = trainer.rasterizer.render(splats, trainer.views[7].camera, 0.005).maps
     good = {trainer.views[at].name for at in trainer.selector.neighbours(7, maps.median)}
     turns = [
-        trainer.neighbour(replace(state, index=at), splats, 7, maps).view.name for at in range(0, 24 * every, every)
+        neighbour(trainer, replace(state, index=at), splats, 7, maps).view.name for at in range(0, 24 * every, every)
     ]
     assert len(good) > 1 and set(turns) == good
 
@@ -226,7 +228,7 @@ def mean_error(trainer, state, loss) -> float:
     values = []
     for at, view in enumerate(trainer.views):
         maps = trainer.rasterizer.render(splats, view.camera, 0.005).maps
-        second = trainer.neighbour(replace(state, index=at), splats, at, maps)
+        second = neighbour(trainer, replace(state, index=at), splats, at, maps)
         target = Target(view, trainer.photos[at] / 255, neighbour=second)
         values.append(float(loss(maps, target)))
     return sum(values) / len(values)

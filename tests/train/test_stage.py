@@ -315,7 +315,7 @@ class Damaged(list):
 def test_damaged_photographs_are_passed_over_and_named_once(begin, monkeypatch):
     trainer, state = begin(replace(QUIET, steps=12))
     said = []
-    monkeypatch.setattr("surfkit.train.stage.emit", said.append)
+    monkeypatch.setattr("surfkit.train.next_view.emit", said.append)
     trainer = replace(trainer, photos=Damaged(trainer.photos))
     shown = [done.target.view.name for done in trainer.run(state)]
     assert sorted(state.skipped) == [1, 4] and len(shown) == 12

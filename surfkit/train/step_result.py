@@ -1,0 +1,38 @@
+"""What a step of a stage knows before it changes anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from surfkit.losses.base import Target
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.train.image_appearance import ImageAppearance
+from surfkit.train.in_view import InView
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """A view as it is rendered, what it is compared with, and the gradients that follow.
+
+    Attributes:
+        target: The view and its photograph.
+        in_view: The points in view, where a step is for these alone; None where it is for all.
+        leaves: Raw parameters of these points, or of all, that gradients can be taken by.
+        shape: The splats made of them.
+        splats: The same, detached, and the frozen ones.
+        render: The view as drawn.
+        losses: Weighted value of each loss.
+        gradients: By the splats.
+        appearance: That of the photograph, with its gradient, if the stage learns any.
+    """
+
+    target: Target
+    in_view: InView | None
+    leaves: Columns
+    shape: Splats
+    splats: Splats
+    render: Render
+    losses: dict[str, float]
+    gradients: Gradients
+    appearance: ImageAppearance | None
