@@ -45,8 +45,9 @@ from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
-from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Stage, StageState
+from surfkit.train.data_cache import CacheSettings
+from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.run.context import RunContext
 
@@ -78,8 +79,8 @@ from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
-from surfkit.train.material import CacheSettings
-from surfkit.train.stage import StageState
+from surfkit.train.data_cache import CacheSettings
+from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.run.stage import Intervals
 from surfkit.blocks.worker import Start
@@ -163,7 +164,7 @@ def merge(out: Path) -> None:
     from surfkit.readers import extract
     from surfkit.run.context import RunContext
     from surfkit.run.stage import Intervals
-    from surfkit.train.material import CacheSettings
+    from surfkit.train.data_cache import CacheSettings
 
     run = opened(out)
     blocks = load_blocks(run, read_plan(run).plan)

@@ -37,7 +37,7 @@ from surfkit.run.folder import Run
 from surfkit.run.stage import Intervals
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 
 def tuning(steps: int) -> dict[str, float]:

@@ -25,7 +25,7 @@ from surfkit.cli.recipes import recipes
 from surfkit.pipeline import Intervals, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 TIMES = ("seconds", "cpu_seconds")
 

@@ -16,7 +16,8 @@ from trained import copied, halfway
 
 from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.recipes import SURFELS
-from surfkit.train.stage import StageState, Trainer
+from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 
 SIGNALS = {
     "all losses": LossGradient(),

@@ -32,8 +32,9 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene
 from surfkit.testing.simulated_gpu import GPU, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 
 SIDE = 64
 

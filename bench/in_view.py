@@ -20,7 +20,8 @@ from surfkit.readers.read import read
 from surfkit.recipes import RECIPES
 from surfkit.scene.photos import view_photo
 from surfkit.train import checkpoint
-from surfkit.train.stage import Trainer
+from surfkit.train.in_view import InView
+from surfkit.train.trainer import Trainer
 
 
 def main() -> None:
@@ -48,7 +49,7 @@ def main() -> None:
             began = time.process_time()
             done = trainer.step(state)
             times[name] += [time.process_time() - began] * (index >= 3)
-        shares.append(float(trainer.in_view(state, done.target.view.camera).rows.numel() / len(state.points)))
+        shares.append(float(InView.of_step(trainer, state, done.target.view.camera).rows.numel() / len(state.points)))
     taken = {name: torch.tensor(each) for name, each in times.items()}
     figures = {
         "points": len(state.points),

@@ -14,7 +14,8 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.scene.photos import photo_cache
-from surfkit.train.stage import StageState, Trainer
+from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"
 

@@ -63,9 +63,9 @@ from surfkit.run.warn import warn_of_gaps, warn_of_no_edits
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
+from surfkit.train.data_cache import CacheSettings, read_ahead
 from surfkit.train.faults import in_one_line
-from surfkit.train.material import CacheSettings, read_ahead
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.stage import MOST_STEPS
 from surfkit.train.state import StageState
 
@@ -118,7 +118,7 @@ def run(
         compute or Compute(),
         intervals or Intervals(),
         caches or CacheSettings(),
-        Meter(),
+        MemoryMeter(),
     )
     if intervals.pictures is None:
         intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
@@ -167,7 +167,7 @@ class Stages:
         state: Of the first stage, where it goes on.
     """
 
-    def __init__(self, ctx: RunContext, compute: Compute, meter: Meter, state: StageState | None) -> None:
+    def __init__(self, ctx: RunContext, compute: Compute, meter: MemoryMeter, state: StageState | None) -> None:
         self.ctx, self.compute, self.meter, self.state = ctx, compute, meter, state
         self.start: InitialPoints | None = None
 
@@ -255,7 +255,7 @@ def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageSt
     return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 
 
-def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter) -> dict[str, Any]:
+def results(ctx: RunContext, made: Reconstruction, device: Device, meter: MemoryMeter) -> dict[str, Any]:
     """Write the results that are missing, as further steps have deleted them, and return all the metrics."""
     run, scene = ctx.run, ctx.scene
     meshed = has_mesh(run, made.last_steps, made.mesh is not None)

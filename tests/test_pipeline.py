@@ -29,7 +29,7 @@ from surfkit.recipe import complete
 from surfkit.run import stage, warn
 from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 STEPS = 60
 

@@ -19,7 +19,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.recipe import Recipe, complete
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 
 __all__ = ["Dataset", "Figures", "Mesh", "OnStep", "TrainedRun", "get_recipe", "open_run", "read", "train"]

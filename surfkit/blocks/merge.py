@@ -16,7 +16,7 @@ from surfkit.partition.merge import Merge, Pieces, Share
 from surfkit.primitives.points import Columns, Points
 from surfkit.run.context import RunContext
 from surfkit.train import checkpoint, streaming
-from surfkit.train.look import fresh_looks
+from surfkit.train.image_appearance import fresh_appearances
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored
@@ -72,7 +72,7 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     state.peak_gpu_bytes = max(part.peak_gpu_bytes for part in parts)
     state.sh_degree = max(part.sh_degree for part in parts)
     if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
-        state.looks = fresh_looks(recipe.tune.appearance, len(ctx.scene.train))
+        state.appearances = fresh_appearances(recipe.tune.appearance, len(ctx.scene.train))
     return state
 
 

@@ -13,7 +13,7 @@ from surfkit.densify.base import Densify
 from surfkit.execute.state import BlockState
 from surfkit.run.folder import RunStage
 from surfkit.train import checkpoint
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 NO_CACHE, NO_GROWTH, START_AGAIN = 1, 2, 3
 

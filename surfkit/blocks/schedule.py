@@ -39,8 +39,8 @@ from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results
 from surfkit.run.notes import prefix_notes, repeat_warnings
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import needs_normals, needs_priors, scale_band
 from surfkit.train.faults import DiskFull
-from surfkit.train.material import needs_normals, needs_priors, scale_band
 from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored
 

@@ -38,9 +38,9 @@ from surfkit.run.notes import prefix_notes
 from surfkit.run.stage import StageJob, load_state, optimise
 from surfkit.scene.scene import View
 from surfkit.start.base import InitialModel
+from surfkit.train.data_cache import read_ahead
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
-from surfkit.train.material import read_ahead
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored, open_last
 
@@ -122,7 +122,7 @@ def take_steps(ctx: RunContext, block: Block) -> None:
         if context == "frozen":
             start, frozen = replace(start, part="own"), replace(start, part="around")
         owns = None if context == "densified" else start.owns
-        intervals, meter = replace(ctx.intervals, pictures=0), Meter.of_stage()
+        intervals, meter = replace(ctx.intervals, pictures=0), MemoryMeter.of_stage()
         job = StageJob(ctx.run, stage, scene, ctx.rasterizer, intervals, given, meter, start, frozen=frozen, owns=owns)
         for until in stops(block, done):
             state = optimise(replace(job, until=until), take_in(block, state))

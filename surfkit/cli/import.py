@@ -21,7 +21,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
 from surfkit.recipes import IMPORTED
 from surfkit.run.folder import Run
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 
 @dataclass(frozen=True)

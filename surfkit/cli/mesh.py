@@ -29,8 +29,8 @@ from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.run.warn import note_held_out
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import full_disk_in_one_line
-from surfkit.train.material import CacheSettings
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from surfkit.recipe import Recipe, unused
 from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run, read_data
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 from surfkit.view.server import LOCAL, Address, refuse_wrong_port
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"

@@ -21,8 +21,8 @@ from surfkit.run.context import RunContext
 from surfkit.run.notes import collect_notes
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals, select_rasterizer
 from surfkit.train.bars import bars
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import in_one_line
-from surfkit.train.material import CacheSettings
 
 
 @dataclass(frozen=True)

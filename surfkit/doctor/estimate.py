@@ -11,7 +11,7 @@ from surfkit.core.memory import size
 from surfkit.doctor.finding import Finding
 from surfkit.doctor.growth import SPREAD, Growth
 from surfkit.doctor.probe import Part, Probed
-from surfkit.train.material import GPU_SHARE
+from surfkit.train.data_cache import GPU_SHARE
 
 EVENT_BYTES = 260
 """A line of events.jsonl."""

@@ -29,7 +29,7 @@ from surfkit.run.stage import CHECKPOINT_EVERY
 from surfkit.scene.copies import place
 from surfkit.scene.memory import cache_bytes, free_bytes
 from surfkit.scene.scene import Scene
-from surfkit.train.material import needs_normals, needs_priors
+from surfkit.train.data_cache import needs_normals, needs_priors
 
 VIEWS = 10
 """Photographs that the probe trains on, evenly chosen; each part of it sees all of them."""

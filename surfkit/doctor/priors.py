@@ -16,7 +16,7 @@ from surfkit.readers.depth_prior import OFF, alignment, normals_warning, prepare
 from surfkit.readers.panoramas import has_panoramas, points_remedy, view_names, view_sizes
 from surfkit.readers.read import build_scene, reader_of
 from surfkit.recipe import Recipe
-from surfkit.train.material import needs_normals, needs_priors
+from surfkit.train.data_cache import needs_normals, needs_priors
 
 
 def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[Finding]:

@@ -38,9 +38,10 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
 from surfkit.scene.vectors import unit
 from surfkit.train import checkpoint
-from surfkit.train.material import needs_normals
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.data_cache import needs_normals
+from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""

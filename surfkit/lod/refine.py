@@ -24,7 +24,9 @@ from surfkit.primitives.points import Columns, Points
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
 from surfkit.train.faults import Diverged
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.next_view import foretell
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 from surfkit.train.views import ViewContributions
 
 SMALLEST_PX = 32
@@ -116,7 +118,7 @@ def _optimised(
     points = Points.fresh({name: value.clone() for name, value in level.params.items()}, primitive.shared())
     state = trainer.begin(points, torch.Generator().manual_seed(given.seed + number))
     state.sh_degree = level.sh_degree
-    trainer.foretell(state.order)
+    foretell(trainer, state.order)
     while state.index < steps:
         trainer.step(state)
         emit(Progress(f"refining level {number} of detail", state.index, steps))

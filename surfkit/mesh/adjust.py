@@ -147,15 +147,10 @@ def filtered(normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return found
 
 
-def beside(faces: np.ndarray) -> np.ndarray:
-    """(2, E) int64 pairs of faces that share an edge."""
-    return between(faces) // 3
-
-
-def between(faces: np.ndarray) -> np.ndarray:
-    """(2, E) int64 pairs of sides of faces that are one edge: side 3 f + k goes from corner k of face f to the next."""
+def beside(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pairs of faces that share an edge, as two (E,) int64."""
     a, b = faces.astype(np.int64), np.roll(faces, -1, 1).astype(np.int64)
     keys = (np.minimum(a, b) << 32 | np.maximum(a, b)).ravel()
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order][1:] == keys[order][:-1])
-    return np.stack([order[same], order[same + 1]])
+    return order[same] // 3, order[same + 1] // 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from surfkit.mesh.adjust import between
+from surfkit.mesh.adjust import beside
 from surfkit.mesh.sights import Sights, boxes_of, for_all
 from surfkit.native import module
 
@@ -35,51 +35,40 @@ def supported(
     views, at = np.zeros(len(faces), np.float32), middles.astype(np.float32)
     job = at, boxes_of(at), normals.astype(np.float32), 0.5 * side, views
     for_all(sights, "confirming", lambda sight: native.confirm(*job, *sight.native, threads))
-    return closed(views >= least_views, points, faces, guesses / 2 * side)
+    return closed(views >= least_views, middles, faces, guesses / 2 * side)
 
 
-def closed(sure: np.ndarray, points: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
+def closed(sure: np.ndarray, middles: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
     """(F,) bool: faces that are sure, and those that no disc outside of these covers; see `supported`.
 
-    Distances are those along the surface, from the middle of a face over the middles of edges.
+    Distances are those along the surface, from middle to middle.
 
     Args:
         sure: (F,) bool.
-        points: (P, 3).
-        faces: (F, 3) rows of points.
+        middles: (F, 3) of the faces.
+        faces: (F, 3).
         radius: Of the disc.
     """
-    halves = between(faces)
-    a, b = halves // 3
-    whole = np.bincount(halves.ravel() // 3, minlength=len(faces)) == 3
+    a, b = beside(faces)
+    neighbours = np.bincount(a, minlength=len(faces)) + np.bincount(b, minlength=len(faces))
     open_ = ~(sure[a] & sure[b])
-    a, b, sides = a[open_], b[open_], halves[0, open_]
-    middles = points[faces].mean(1)
-    edges = (points[faces.ravel()[sides]] + points[np.roll(faces, -1, 1).ravel()[sides]]) / 2
-    reach = np.linalg.norm(middles[a] - edges, axis=1), np.linalg.norm(middles[b] - edges, axis=1)
-    outside = ~sure & ((within(sure, a, b, reach, radius) > radius) | ~whole)
-    return sure | (within(outside, a, b, reach, radius) > radius)
+    a, b = a[open_], b[open_]
+    lengths = np.linalg.norm(middles[a] - middles[b], axis=1)
+    begins = np.zeros(len(faces), bool)
+    begins[a[sure[a]]] = begins[b[sure[b]]] = True
+    outside = ~sure & (within(begins, a, b, lengths, radius) > radius)
+    outside |= ~sure & (neighbours < 3)
+    return sure | (within(outside, a, b, lengths, radius) > radius)
 
 
-def within(
-    begins: np.ndarray, a: np.ndarray, b: np.ndarray, reach: tuple[np.ndarray, np.ndarray], limit: float
-) -> np.ndarray:
-    """(F,) distance of the middles of faces from the border of those where `begins` (F,) is true, 0 in these and
-    infinite beyond a limit.
-
-    Args:
-        begins: See above.
-        a: (E,) faces on one side of edges.
-        b: (E,) faces on the other side.
-        reach: (E,) distances of the middles of both from the edge.
-        limit: See above.
-    """
+def within(begins: np.ndarray, a: np.ndarray, b: np.ndarray, lengths: np.ndarray, limit: float) -> np.ndarray:
+    """(F,) distance from the next of the faces where `begins` (F,) is true, over pairs a, b (E,) of faces that are
+    `lengths` (E,) apart; infinite beyond a limit."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
     count, sources = len(begins), np.flatnonzero(begins)
     if not len(sources):
         return np.full(count, np.inf)
-    lengths = np.where(begins[a], 0, reach[0]) + np.where(begins[b], 0, reach[1])
     ways = coo_matrix((np.maximum(lengths, 1e-30), (a, b)), shape=(count, count)).tocsr()
     return dijkstra(ways, directed=False, indices=sources, min_only=True, limit=limit)

@@ -31,7 +31,7 @@ from surfkit.report.perceptual import measure_lpips
 from surfkit.report.truth import Truth
 from surfkit.run.notes import collect_notes
 from surfkit.run.store import StageStore
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 TRACE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""

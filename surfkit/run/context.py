@@ -9,7 +9,7 @@ from surfkit.run.folder import Run
 from surfkit.run.shared import Shares
 from surfkit.run.stage import Intervals
 from surfkit.scene.scene import Scene
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 
 @dataclass(frozen=True)

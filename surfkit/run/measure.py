@@ -21,7 +21,7 @@ from surfkit.run.folder import Run, RunStage, note_metrics, read_record
 from surfkit.run.method import not_drawn
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 
 AHEAD = 8
 """Photographs in memory while held-out ones are measured: each is needed once."""
@@ -31,7 +31,7 @@ def evaluate(
     run: Run,
     made: Reconstruction,
     scene: Scene,
-    meter: Meter | None = None,
+    meter: MemoryMeter | None = None,
     lpips_weights: str = "auto",
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.

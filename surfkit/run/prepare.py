@@ -25,7 +25,7 @@ from surfkit.readers.read import observations
 from surfkit.run.folder import Run, read_data
 from surfkit.run.mesh import has_mesh
 from surfkit.scene.scene import Scene
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.streaming import open_last
 
 

@@ -24,8 +24,8 @@ from surfkit.scene.cache import Cache
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel
-from surfkit.train.material import TrainingData, read_ahead
-from surfkit.train.meter import Meter
+from surfkit.train.data_cache import TrainingData, read_ahead
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.state import StageState
 
 DRAWN_AHEAD = 2
@@ -75,7 +75,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
             measure_before(stage, made(), scene)
         shown = _rendered_data(before, given, scene, ctx.rasterizer) if refine.taught else None
         shown = shown or read_ahead(run.data, scene, stage.stage.losses, ctx.caches)
-        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, Meter.of_stage(), start, given)
+        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, MemoryMeter.of_stage(), start, given)
         return optimise(job, state)
 
 

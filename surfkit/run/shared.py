@@ -23,7 +23,7 @@ from surfkit.run import journal
 from surfkit.run.folder import SHARED, Run
 from surfkit.run.notes import prefix_notes, repeat_warnings
 from surfkit.run.store import Entry, StageStore
-from surfkit.train.material import needs_priors
+from surfkit.train.data_cache import needs_priors
 
 FILES = {
     "pretrain": ("events.jsonl", "pretrain/checkpoint.safetensors"),

@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -25,14 +26,15 @@ from surfkit.scene.memory import free_bytes
 from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import TrainingData
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
+from surfkit.train.in_view import with_frozen
 from surfkit.train.interrupt import graceful
-from surfkit.train.material import TrainingData
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.progress import Display
-from surfkit.train.sparing import lowered
-from surfkit.train.stage import Trainer
+from surfkit.train.retry_on_oom import lowered
 from surfkit.train.state import StageState
+from surfkit.train.trainer import Trainer
 from surfkit.train.watch import Stopwatch, Watched, watched
 
 CHECKPOINT_EVERY = 500
@@ -81,7 +83,7 @@ class StageJob:
     rasterizer: Rasterizer
     intervals: Intervals
     given: TrainingData
-    meter: Meter
+    meter: MemoryMeter
     start: Callable[[torch.Generator], InitialModel]
     before: StageState | None = None
     frozen: Callable[[], InitialModel] | None = None
@@ -119,57 +121,80 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
     On NaN or Inf it returns to its last checkpoint with half the learning rates, twice at most. When memory runs out,
     it returns to its last checkpoint with a smaller cache, until there is no cache; for the GPU, with no cache there.
     """
-    at, given, stage, primitive = job.stage, job.given, job.stage.stage, job.stage.primitive
-    sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
-    on_gpu = job.rasterizer.where().type == "cuda"
-    trainer = Trainer(
-        stage, primitive, job.scene.train, *sources, job.owns, gpu_bytes=given.gpu_bytes() if on_gpu else 0
-    )
-    along = (
-        ProgressPictures(at.out / "progress", job.scene.held_out)
-        if job.intervals.pictures and job.scene.held_out
-        else None
-    )
-
-    def begin() -> StageState:
-        generator = torch.Generator().manual_seed(job.run.recipe.seed)
-        began = time.perf_counter(), time.process_time()
-        begun = job.start(generator)
-        fresh = trainer.begin(
-            replace(Points.fresh(begun.params, primitive.shared()), stats=dict(begun.stats)),
-            generator,
-            job.frozen().params if job.frozen else None,
-        )
-        fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
-        fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
-        if job.before is not None:
-            fresh.seconds += job.before.seconds
-            fresh.cpu_seconds += job.before.cpu_seconds
-            fresh.peak_memory_bytes = job.before.peak_memory_bytes
-            fresh.peak_gpu_bytes = job.before.peak_gpu_bytes
-        return fresh
-
+    trainer, along = trainer_of(job), pictures_of(job)
+    fresh = partial(begin, job, trainer)
     if state is not None:
-        say(f"{at.out}: going on after step {state.index} of {stage.steps}")
-    state = state or begin()
+        say(f"{job.stage.out}: going on after step {state.index} of {job.stage.stage.steps}")
+    state = state or fresh()
     while True:
         try:
             return take_steps(job, trainer, state, along)
         except Diverged as error:
-            state = return_to_checkpoint(at, state.halvings, error, begin)
+            state = return_to_checkpoint(job.stage, state.halvings, error, fresh)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
-            if is_out_of_gpu_memory(error):
-                if state.whole and state.index and at.block is None:  # a block falls back to an earlier, smaller state
-                    save(at, state, job.meter)
-                if not trainer.uploads.bytes:
-                    raise out_of_memory(at.out, ", though photographs are not kept in it", error) from error
-                emit(Warned(lowered(trainer.uploads, f"step {state.index + 1}: the memory of the GPU gave out")))
-            elif not lower_caches(given, f"step {state.index + 1}: out of memory"):
-                raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
+            make_room(job, trainer, state, error)
             state = None  # the error and all that it holds go first
-        state = state or load_last_state(at, begin)
+        state = state or load_last_state(job.stage, fresh)
+
+
+def trainer_of(job: StageJob) -> Trainer:
+    """What takes the steps of the stage."""
+    given, at, rasterizer = job.given, job.stage, job.rasterizer
+    return Trainer(
+        at.stage,
+        at.primitive,
+        job.scene.train,
+        given.photos,
+        rasterizer,
+        given.priors,
+        given.masks,
+        given.expect,
+        job.owns,
+        gpu_bytes=given.gpu_bytes() if rasterizer.where().type == "cuda" else 0,
+    )
+
+
+def pictures_of(job: StageJob) -> ProgressPictures | None:
+    """What draws a few held-out views while the stage runs; None if there are none, or nobody wants them."""
+    if not job.intervals.pictures or not job.scene.held_out:
+        return None
+    return ProgressPictures(job.stage.out / "progress", job.scene.held_out)
+
+
+def begin(job: StageJob, trainer: Trainer) -> StageState:
+    """The state before the first step; its times and peaks include those of the stage before, if they count too."""
+    generator = torch.Generator().manual_seed(job.run.recipe.seed)
+    began = time.perf_counter(), time.process_time()
+    start, primitive = job.start(generator), job.stage.primitive
+    points = replace(Points.fresh(start.params, primitive.shared()), stats=dict(start.stats))
+    state = trainer.begin(points, generator, job.frozen().params if job.frozen else None)
+    state.sh_degree = min(start.sh_degree, primitive.sh_degree)
+    state.seconds, state.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
+    if job.before is not None:
+        state.seconds += job.before.seconds
+        state.cpu_seconds += job.before.cpu_seconds
+        state.peak_memory_bytes = job.before.peak_memory_bytes
+        state.peak_gpu_bytes = job.before.peak_gpu_bytes
+    return state
+
+
+def make_room(job: StageJob, trainer: Trainer, state: StageState, error: MemoryError | RuntimeError) -> None:
+    """Keep fewer photographs in the memory that has given out, with a warning.
+
+    Raises:
+        OutOfMemory: None are kept in it any more.
+    """
+    at, where = job.stage, f"step {state.index + 1}"
+    if is_out_of_gpu_memory(error):
+        if state.whole and state.index and at.block is None:  # a block falls back to an earlier, smaller state
+            save(at, state, job.meter)
+        if not trainer.uploads.bytes:
+            raise out_of_memory(at.out, ", though photographs are not kept in it", error) from error
+        emit(Warned(lowered(trainer.uploads, f"{where}: the memory of the GPU gave out")))
+    elif not lower_caches(job.given, f"{where}: out of memory"):
+        raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
 
 
 def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: ProgressPictures | None) -> StageState:
@@ -207,7 +232,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     return state
 
 
-def save(stage: RunStage, state: StageState, meter: Meter) -> None:
+def save(stage: RunStage, state: StageState, meter: MemoryMeter) -> None:
     """Write a checkpoint, and emit what the memory is used for."""
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
     state.peak_gpu_bytes = max(state.peak_gpu_bytes, peak_gpu_bytes())
@@ -226,16 +251,21 @@ def lower_caches(given: TrainingData, why: str) -> bool:
     return found is not None
 
 
-def load_last_state(stage: RunStage, begin: Callable[[], StageState]) -> StageState:
+def last_state(stage: RunStage, fresh: Callable[[], StageState]) -> StageState:
     """The state of the last checkpoint, or a new one."""
     found = checkpoint.load_last(stage.checkpoint)
-    state = found[0] if found else begin()
+    return found[0] if found else fresh()
+
+
+def load_last_state(stage: RunStage, fresh: Callable[[], StageState]) -> StageState:
+    """The same, and say so."""
+    state = last_state(stage, fresh)
     say(f"{stage.out}: going on after step {state.index} of {stage.stage.steps}")
     return state
 
 
 def return_to_checkpoint(
-    stage: RunStage, halvings: int, error: Diverged, begin: Callable[[], StageState]
+    stage: RunStage, halvings: int, error: Diverged, fresh: Callable[[], StageState]
 ) -> StageState:
     """The state of the last checkpoint, or a new one, with half the learning rates; saved, so that they stay so.
 
@@ -247,8 +277,7 @@ def return_to_checkpoint(
             f"{stage.out}: {error}, also after the learning rates were halved {halvings} times; look at that "
             f"photograph and its camera, or lower {stage.setting}.rates in another folder; the last checkpoint is whole"
         ) from error
-    found = checkpoint.load_last(stage.checkpoint)
-    state = found[0] if found else begin()
+    state = last_state(stage, fresh)
     state.halvings = halvings + 1
     times = f"{state.halvings} of {MOST_HALVINGS} times"
     emit(Warned(f"{error}; back to step {state.index}, with learning rates halved ({times})"))
@@ -270,7 +299,7 @@ def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable
     def draw(view: View, geometry: bool) -> Maps:
         with job.meter.adding("pictures"):
             degree = state.sh_degree
-            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), degree), degree)
+            splats = with_frozen(trainer, state, at.primitive.activate(at.stage.finished(state), degree), degree)
             return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
 
     return draw

@@ -14,7 +14,7 @@ from surfkit.readers.read import observations
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel, StartInput
-from surfkit.train.material import TrainingData, needs_normals, needs_priors, scale_band
+from surfkit.train.data_cache import TrainingData, needs_normals, needs_priors, scale_band
 
 AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""

@@ -104,7 +104,7 @@ def _made(method: Method, data: Data, folder: Path) -> Reconstruction:
     from surfkit.run.folder import Run
     from surfkit.run.method import method_input, with_drawing
     from surfkit.run.stage import Intervals
-    from surfkit.train.material import CacheSettings
+    from surfkit.train.data_cache import CacheSettings
 
     run = Run(folder, Recipe(method=method), data)
     ctx = RunContext(run, read(data), select("cpu")[0], Intervals(checkpoint=1), CacheSettings())

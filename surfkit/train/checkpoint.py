@@ -74,7 +74,7 @@ def save(path: Path, state: StageState) -> None:
 
 def beside_points(state: StageState) -> tuple[dict[str, Tensor], str]:
     """What a file holds of a state beside its points: tensors, and facts as text."""
-    tensors = {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
+    tensors = {f"looks.{name}": value.contiguous() for name, value in state.appearances.items()}
     tensors |= {f"shared.{name}": value.contiguous() for name, value in state.points.shared.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
     facts = {"views": state.order.count, "shown": state.order.at} | {name: getattr(state, name) for name in SCALARS}
@@ -155,7 +155,7 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         group, _, name = key.partition(".")
         if group in groups:
             groups[group][name] = value
-    looks, frozen = groups.pop("looks"), groups.pop("frozen")
+    appearances, frozen = groups.pop("looks"), groups.pop("frozen")
     columns = {attribute: groups[group] for group, attribute in GROUPS.items()}
     points = Points(**columns, shared=groups["shared"])
     _check(path, points, tensors["order"], facts)
@@ -166,7 +166,9 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
     except (TypeError, RuntimeError) as error:
         raise _unusable(path, "the state of the random generator is none") from error
     order = Order(facts["views"], tensors["order"], facts["shown"])
-    state = StageState(points, order, generator, looks=looks, frozen=frozen, **{name: facts[name] for name in SCALARS})
+    state = StageState(
+        points, order, generator, appearances=appearances, frozen=frozen, **{name: facts[name] for name in SCALARS}
+    )
     state.skipped = list(state.skipped)
     return state
 

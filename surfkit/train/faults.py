@@ -14,7 +14,7 @@ from surfkit.core.check import Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory
 from surfkit.core.memory import out_of_memory as say_out_of_memory
-from surfkit.train.cotangents import as_numbers
+from surfkit.train.loss_gradients import as_numbers
 
 MOST_HALVINGS = 2
 """Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""

@@ -12,6 +12,8 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.camera import Camera
+from surfkit.train.setup import StageSetup
+from surfkit.train.state import StageState
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class InView:
         splats = primitive.activate(params, 0)
         return cls(true_rows(rasterizer.in_view(splats, camera, near)), splats)
 
+    @classmethod
+    def of_step(cls, setup: StageSetup, state: StageState, camera: Camera) -> InView | None:
+        """The points that the coming step is for; None where it is for all (`Stage.update`)."""
+        stage = setup.stage
+        if stage.update == "all" or stage.regularizers or stage.is_paired(state.index + 1):
+            return None  # regularizers and second views look at other points too
+        if setup.draws is not setup.rasterizer or state.points.shared:
+            return None
+        return cls.of(setup.primitive, state.points.params, camera, setup.rasterizer, stage.near)
+
     def of_columns(self, columns: Columns) -> Columns:
         """(R, ...) of each of (N, ...)."""
         return {name: value.index_select(0, self.rows) for name, value in columns.items()}
@@ -41,6 +53,19 @@ class InView:
         """(N, ...) of (R, ...), 0 for the points that are not in view."""
         found = values.new_zeros(len(self.splats), *values.shape[1:])
         return found.index_copy_(0, self.rows, values)
+
+
+def with_frozen(
+    setup: StageSetup, state: StageState, shape: Splats, degree: int, camera: Camera | None = None
+) -> Splats:
+    """The splats of a state, detached, and then those that are frozen; of these, with a camera, those in view."""
+    splats, frozen = shape.detached(), state.frozen
+    if not frozen:
+        return splats
+    if camera is not None:
+        frozen = InView.of(setup.primitive, frozen, camera, setup.rasterizer, setup.stage.near).of_columns(frozen)
+    shared = {name: value.detach() for name, value in state.points.shared.items()}
+    return splats.and_then(setup.primitive.activate(frozen | shared, degree))
 
 
 def true_rows(mask: Tensor) -> Tensor:

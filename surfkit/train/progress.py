@@ -15,7 +15,7 @@ from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.raster.psnr import psnr
-from surfkit.train.stage import Done
+from surfkit.train.trainer import Done
 
 PLAIN_EVERY_S = 5.0
 """Between two lines where there is no terminal to draw on."""

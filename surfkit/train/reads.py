@@ -5,6 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from surfkit.losses.base import Loss, Regularizer
+from surfkit.train.setup import StageSetup
+
+GEOMETRY = {"depth", "median", "normal", "distortion"}
+"""Maps beyond the colours."""
+
+
+def maps_of_step(setup: StageSetup, index: int) -> dict[str, str]:
+    """By the name of a map that the terms of step `index` read, the path of one of these terms."""
+    stage, steps = setup.stage, [index]
+    if index == 1 and setup.draws is not setup.rasterizer:
+        # what a render of the primitive's own lacks for the last steps is told now, not after hours
+        steps += [max(1, stage.steps + at) for at in range(-99, 1)]
+    return maps_read(stage.losses, stage.regularizers, steps, stage.steps)
 
 
 def maps_read(

@@ -27,8 +27,8 @@ class StageState:
     """Most memory held so far; 0 where the system does not tell."""
     peak_gpu_bytes: int = 0
     """Most memory of the GPU held so far; 0 without one."""
-    looks: Columns = field(default_factory=dict)
-    """What is known of the look of each photograph (`train.look`)."""
+    appearances: Columns = field(default_factory=dict)
+    """What is known of the appearance of each photograph (`train.image_appearance`)."""
     reset_at: int = 0
     """Step that last lowered the opacities; 0 if none has."""
     sh_degree: int = 0
@@ -46,7 +46,7 @@ class StageState:
         """Put what is optimised, and what is drawn with it, on a device; counts stay where the host reads them."""
         self.points = self.points.to(device)
         self.frozen = {name: value.to(device) for name, value in self.frozen.items()}
-        self.looks = {n: v.to(device) if v.is_floating_point() else v for n, v in self.looks.items()}
+        self.appearances = {n: v.to(device) if v.is_floating_point() else v for n, v in self.appearances.items()}
 
     @property
     def seed(self) -> int:

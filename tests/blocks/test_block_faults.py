@@ -40,9 +40,10 @@ from surfkit.run.stage import Intervals
 from surfkit.scene import memory
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
-from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 STEPS = 12
 EVERY = Intervals(checkpoint=3, pictures=0)
@@ -185,7 +186,7 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
         job = command(ctx, block, compute)
         code = (
             "import resource, sys, psutil, torch\nfrom surfkit.cli import main\nimport surfkit.cli.tune\n"
-            "from surfkit.train.stage import Trainer\nstep = Trainer.step\n"
+            "from surfkit.train.trainer import Trainer\nstep = Trainer.step\n"
             "def hungry(self, state):\n    held = torch.empty(10_000_000 * len(state.points), dtype=torch.uint8)\n"
             "    return step(self, state)\nTrainer.step = hungry\n"
             "most = psutil.Process().memory_info().vms + 3_000_000_000\n"

@@ -28,7 +28,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, write_map, write_record
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.material import CacheSettings
+from surfkit.train.data_cache import CacheSettings
 
 DENSIFY = ADC(start=2, until=STEPS, every=2, threshold=1e-9, reset_every=7, recovery=0)
 

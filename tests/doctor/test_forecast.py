@@ -31,7 +31,7 @@ from surfkit.recipes.surface import SURFACE
 from surfkit.scene.scene import Cloud
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 STARTED = Started(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
 WRITTEN = Written(700.0, 250.0, 10_000, 1.0, 5.0, 2_000_000_000)

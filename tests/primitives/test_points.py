@@ -7,7 +7,7 @@ from surfkit.core.check import BadInput
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.edit import Edit, NewPoints, apply, merge, withheld
 from surfkit.primitives.points import Points
-from surfkit.train.stage import Trainer
+from surfkit.train.policies import wanted
 
 
 def points(count: int = 6) -> Points:
@@ -54,13 +54,13 @@ def test_what_a_policy_gives_must_fit_the_points(asked, message):
         def edit(self, points, step):
             return asked
 
-    trainer = SimpleNamespace(stage=SimpleNamespace(policies=[Policy()]), owns=None)
+    step = SimpleNamespace(owns=None)
     with pytest.raises(BadInput, match=message):
-        Trainer.wanted(trainer, points(), None)
+        wanted([Policy()], points(), step)
     asked = Edit(drop=mask(1), clone=torch.ones(6, dtype=torch.int64), move=torch.ones(6, 3))
-    assert Trainer.wanted(trainer, points(), None).counts == (1, 5, 0)
+    assert wanted([Policy()], points(), step).counts == (1, 5, 0)
     asked = None
-    assert Trainer.wanted(trainer, points(), None) is None
+    assert wanted([Policy()], points(), step) is None
 
 
 def test_new_rows_start_without_a_past():

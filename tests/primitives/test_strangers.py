@@ -36,7 +36,8 @@ from surfkit.scene.scene import Cloud
 from surfkit.testing import check_primitive
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 
 @dataclass(frozen=True)

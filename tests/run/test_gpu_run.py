@@ -22,8 +22,8 @@ from surfkit.report.status import status
 from surfkit.run import measure
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Trainer
+from surfkit.train import trainer
+from surfkit.train.data_cache import CacheSettings
 
 STEPS = 20
 EVERY = Intervals(checkpoint=8, pictures=0)
@@ -56,15 +56,15 @@ def cloud(out):
 
 
 def during(monkeypatch, name, at, act):
-    """Let `act` be called when a method of the trainer is, before step `at`; each time it comes there."""
-    method = getattr(Trainer, name)
+    """Let `act` be called when a part of step `at` is, before it; each time it comes there."""
+    part = getattr(trainer, name)
 
-    def called(self, state, *given):
+    def called(setup, state, *given):
         if state.index + 1 == at:
             act()
-        return method(self, state, *given)
+        return part(setup, state, *given)
 
-    monkeypatch.setattr(Trainer, name, called)
+    monkeypatch.setattr(trainer, name, called)
 
 
 def test_its_memory_is_told_beside_that_of_the_cpu(gpu, data, recipe, tmp_path):
@@ -107,7 +107,7 @@ def test_where_it_gives_out_for_good_the_last_step_is_kept_and_the_same_command_
 ):
     run(recipe, data, tmp_path / "whole", intervals=EVERY)
     with monkeypatch.context() as patch:
-        during(patch, "seen", 14, lambda: setattr(gpu, "limit", gpu.held + 50_000))
+        during(patch, "view_gradients", 14, lambda: setattr(gpu, "limit", gpu.held + 50_000))
         with pytest.raises(Fault, match=r"run: out of GPU memory with .* more wanted .*--device cpu") as fault:
             run(recipe, data, tmp_path / "run", intervals=EVERY)
     assert fault.value.status == 1 and fault.value.kind == "oom" and "\n" not in str(fault.value)
@@ -129,7 +129,7 @@ def test_where_it_gives_out_half_way_through_a_step_the_run_returns_to_its_check
         times.append(gpu.allocations)
         gpu.refused = {gpu.allocations + 3} if len(times) == 1 else set()
 
-    during(monkeypatch, "learn", 14, fail)
+    during(monkeypatch, "update", 14, fail)
     run(recipe, data, tmp_path / "run", intervals=EVERY)
     assert len(times) == 2, "the step is made again, from the last checkpoint"
     assert any("step 14: the memory of the GPU gave out; 0 MB of photo" in text for text in notes(tmp_path / "run"))

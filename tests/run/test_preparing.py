@@ -30,8 +30,9 @@ from surfkit.readers.made_maps import folder_of, located, read_made
 from surfkit.recipe import Recipe
 from surfkit.start.stereo import StereoStart
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.data_cache import CacheSettings
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 SWEEP = PlaneSweep(longest=32, neighbours=2, max_planes=16)
 

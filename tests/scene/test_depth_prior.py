@@ -20,7 +20,7 @@ from surfkit.readers.read import observations, read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.align import align, sample
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import scale_band
+from surfkit.train.data_cache import scale_band
 
 
 @pytest.fixture(scope="module")

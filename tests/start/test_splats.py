@@ -22,7 +22,7 @@ from surfkit.start.base import StartInput
 from surfkit.start.splats import SplatStart
 from surfkit.testing import check_start
 from surfkit.testing.inputs import start_input
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,7 @@ def tiny() -> Tiny:
 def begin(tiny):
     """A function from a stage to a trainer and its first state."""
     from surfkit.primitives.points import Points
-    from surfkit.train.stage import Trainer
+    from surfkit.train.trainer import Trainer
 
     def start(stage, primitive=None, seed=0):
         primitive = primitive or Surfel2D(sh_degree=1)

@@ -22,12 +22,12 @@ def test_each_photograph_learns_its_own_exposure(begin, tmp_path):
                 save(tmp_path / "c.safetensors", state)
         found |= {"loss": sum(losses[-60:]), "state": state, "trainer": trainer}
     assert learned["loss"] < 0.65 * plain["loss"]
-    value = learned["state"].looks["value"]
+    value = learned["state"].appearances["value"]
     grey = torch.tensor([0.4, 0.4, 0.4, 1.0])
     bright, dark = ((value[gains == gain] @ grey).mean() for gain in (1.0, 0.5))
     assert 0.35 < dark / bright < 0.65
-    assert learned["state"].looks["shown"].tolist() == [40] * 6
+    assert learned["state"].appearances["shown"].tolist() == [40] * 6
     again = load(tmp_path / "c.safetensors")
     list(learned["trainer"].run(again))
-    assert torch.equal(again.looks["value"], value)
+    assert torch.equal(again.appearances["value"], value)
     assert torch.equal(again.points.params["sh0"], learned["state"].points.params["sh0"])

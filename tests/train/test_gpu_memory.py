@@ -13,8 +13,8 @@ from surfkit.densify.adc import ADC
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.scene.cache import Cache
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, simulated_gpu
-from surfkit.train.material import TrainingData
-from surfkit.train.meter import Meter
+from surfkit.train.data_cache import TrainingData
+from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.stage import Stage
 from surfkit.train.uploads import Shown, Uploads
 
@@ -98,9 +98,9 @@ def test_an_allocation_counts_once_and_until_it_is_freed():
 def test_the_peak_is_told_by_part(there, tiny):
     with simulated_gpu() as gpu:
         trainer, state = there(BIG)
-        meter, material, told = Meter(), TrainingData(Cache(tiny.photos.__getitem__, [1848] * 6)), []
+        meter, data, told = MemoryMeter(), TrainingData(Cache(tiny.photos.__getitem__, [1848] * 6)), []
         for _ in trainer.run(state):
-            meter.step(state, material, trainer.uploads)
+            meter.step(state, data, trainer.uploads)
             told.append(peak_gpu_bytes())
         report = meter.gpu_report()
         held = sum(value.nbytes for group in vars(state.points).values() for value in group.values())
@@ -109,9 +109,9 @@ def test_the_peak_is_told_by_part(there, tiny):
         assert report["steps"] > 0 and sum(report.values()) == 2 * gpu.peak
         assert meter.parts["points"] == 0, "they are not on the CPU"
         before = gpu.peak
-        Meter()
+        MemoryMeter()
         assert gpu.peak == gpu.held < before, "each stage has its own peak"
-    assert Meter().gpu_report() == {}
+    assert MemoryMeter().gpu_report() == {}
 
 
 @pytest.mark.parametrize(("budget", "kept"), [(0, 0), (3 * 4 * 22 * 28, 3), (BIG, 6)])

@@ -5,7 +5,7 @@ from rich.console import Console
 
 from surfkit.raster.api import Maps
 from surfkit.train.progress import Display, Mean, clock, outer
-from surfkit.train.stage import Done
+from surfkit.train.trainer import Done
 
 
 class Shown:

@@ -294,9 +294,9 @@ def test_halved_rates_move_everything_half_as_far(begin):
     for halvings in (0, 1):
         trainer, state = begin(replace(QUIET, appearance=Exposure()))
         state.halvings = halvings
-        start = {name: value.clone() for name, value in (state.points.params | state.looks).items()}
+        start = {name: value.clone() for name, value in (state.points.params | state.appearances).items()}
         trainer.step(state)
-        moved.append({name: (state.points.params | state.looks)[name] - start[name] for name in start})
+        moved.append({name: (state.points.params | state.appearances)[name] - start[name] for name in start})
     for name in ("means", "sh0", "opacities", "value"):
         assert moved[0][name].any() and torch.allclose(moved[0][name], 2 * moved[1][name], atol=1e-6), name
 
@@ -315,7 +315,7 @@ class Damaged(list):
 def test_damaged_photographs_are_passed_over_and_named_once(begin, monkeypatch):
     trainer, state = begin(replace(QUIET, steps=12))
     said = []
-    monkeypatch.setattr("surfkit.train.stage.emit", said.append)
+    monkeypatch.setattr("surfkit.train.next_view.emit", said.append)
     trainer = replace(trainer, photos=Damaged(trainer.photos))
     shown = [done.target.view.name for done in trainer.run(state)]
     assert sorted(state.skipped) == [1, 4] and len(shown) == 12

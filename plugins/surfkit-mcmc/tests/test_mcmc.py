@@ -21,7 +21,7 @@ from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
 from surfkit.testing import check, check_policy
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 N = 400
 

@@ -22,7 +22,7 @@ from surfkit.scene.photos import photo_cache
 from surfkit.start.base import StartInput
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 GROWTH = AnchorGrowth(start=10, until=50, every=10, progressive=20, shown=0.2)
 

@@ -22,7 +22,7 @@ from surfkit.primitives import Surfel2D
 from surfkit.primitives.init import SH_C0
 from surfkit.raster.select import select
 from surfkit.testing import check, check_policy
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 N = 200
 DUE = 700

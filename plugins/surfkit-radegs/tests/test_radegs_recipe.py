@@ -20,7 +20,7 @@ from surfkit.raster.select import select
 from surfkit.report.ablation import build, offered_tables
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
-from surfkit.train.stage import Trainer
+from surfkit.train.trainer import Trainer
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,8 @@ from surfkit.run.shared import part_keys
 from surfkit.testing import check
 from surfkit.testing.inputs import above, crowd, splats, survey
 from surfkit.train import checkpoint
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 
 @pytest.fixture(autouse=True)

@@ -100,14 +100,25 @@ class Pass:
         self.program = partial(program, KIND=self.kind)  # which knows nothing of this pass: its tensors go with it
         self.device, self.home, self.view = device, splats.means.device, _view(splats, camera, near, rim)
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
-        count, shape = len(splats), self.arrays[0].new_empty(0)
-        tiles, self.radii = shape.new_empty(count, dtype=torch.int32), shape.new_empty(count)
-        depth, invalid = shape.new_empty(count), shape.new_full((1,), NEVER, dtype=torch.int64)
         self.coefficients = self.arrays[4].shape[1]
+        self.tiles = self.view.tiles[0] * self.view.tiles[1]
         project = self.program("project", LEVEL=COLOR, CHOSEN=NOTHING, COEFFICIENTS=self.coefficients)
-        project.launch("measure", blocks(count), 128, *self.arrays[:4], self.view, tiles, depth, self.radii, invalid)
-        self.seen = tiles > 0
-        seen, slots, wrong = torch.stack([self.seen.sum(), tiles.sum(), invalid[0]]).tolist()  # waits for the device
+        touched, depth, slots = self._measure(project, splats)
+        self._order(touched, depth)
+        self._record(project, slots)
+
+    def _measure(self, project: Kernels, splats: Splats) -> tuple[Tensor, Tensor, int]:
+        """(N,) int32 tiles that each splat touches, (N,) depths, and the sum of the former; sets `seen` and `radii`.
+
+        Raises:
+            BadInput: A splat cannot be drawn, or there are too many slots.
+        """
+        count, shape = len(splats), self.arrays[0].new_empty(0)
+        touched, self.radii = shape.new_empty(count, dtype=torch.int32), shape.new_empty(count)
+        depth, invalid = shape.new_empty(count), shape.new_full((1,), NEVER, dtype=torch.int64)
+        project.launch("measure", blocks(count), 128, *self.arrays[:4], self.view, touched, depth, self.radii, invalid)
+        self.seen = touched > 0
+        slots, wrong = torch.stack([touched.sum(), invalid[0]]).tolist()  # waits for the device
         if wrong != NEVER:
             validate(splats)
             raise BadInput(f"splats: row {wrong} is out of the range of float32")
@@ -116,18 +127,25 @@ class Pass:
                 f"{slots:,} pairs of a splat and a tile in one view, at most 2^31 can be drawn; lower the "
                 "number of splats or the size of the photographs"
             )
-        self.index = self.seen.nonzero()[:, 0]
-        self.index = self.index[depth[self.index].argsort(stable=True)]
-        self.first = torch.zeros(seen + 1, dtype=torch.int64, device=device)
-        torch.cumsum(tiles[self.index], 0, out=self.first[1:])
-        self.records = shape.new_empty(seen * RECORD_BYTES[self.kind], dtype=torch.uint8)
+        return touched, depth, slots
+
+    def _order(self, touched: Tensor, depth: Tensor) -> None:
+        """Give the splats that are seen a record each, by depth, and a slot for each tile; sets `index` and `first`."""
+        index = self.seen.nonzero()[:, 0]
+        self.index = index[depth[index].argsort(stable=True)]
+        self.first = torch.zeros(len(index) + 1, dtype=torch.int64, device=self.device)
+        torch.cumsum(touched[self.index], 0, out=self.first[1:])
+
+    def _record(self, project: Kernels, slots: int) -> None:
+        """Write the records, and list them by tile; sets `records`, `entries` and `offsets`."""
+        shape, count = self.arrays[0].new_empty(0), len(self.index)
+        self.records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
         tile_of, record_of = shape.new_empty(2, slots, dtype=torch.int32).unbind()
         given = *self.arrays, self.view, self.index, self.first
-        project.launch("record", blocks(seen), 128, *given, self.records, tile_of, record_of)
+        project.launch("record", blocks(count), 128, *given, self.records, tile_of, record_of)
         tile_of, slot = tile_of.sort(stable=True)
         self.entries = torch.stack([record_of[slot], slot.int()], 1)
-        self.tiles = self.view.tiles[0] * self.view.tiles[1]
-        self.offsets = torch.searchsorted(tile_of, torch.arange(self.tiles + 1, device=device, dtype=torch.int32))
+        self.offsets = torch.searchsorted(tile_of, torch.arange(self.tiles + 1, device=self.device, dtype=torch.int32))
 
     @property
     def lists(self) -> tuple[object, ...]:

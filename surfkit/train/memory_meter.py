@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from surfkit.core.events import MemoryTaken, emit
 from surfkit.core.memory import highest_memory_bytes, peak_memory_bytes, reset_peak_memory, resident_bytes
 from surfkit.cuda.memory import peak_gpu_bytes, reset_peak_gpu
-from surfkit.train.material import TrainingData
+from surfkit.train.data_cache import TrainingData
 from surfkit.train.state import StageState
 from surfkit.train.uploads import Uploads
 
 
-class Meter:
+class MemoryMeter:
     """Splits the most memory that was held since it was made into parts, in bytes, which add up to it.
 
     The peak of the process counts anew from then on, so that what was held before, such as by another run, does not
@@ -34,7 +34,7 @@ class Meter:
         self.added = {"checkpoints": 0, "pictures": 0}
 
     @classmethod
-    def of_stage(cls) -> Meter:
+    def of_stage(cls) -> MemoryMeter:
         """A meter of a stage within a run; what the run has held since the meter before is emitted."""
         peak, on_gpu = peak_memory_bytes(), peak_gpu_bytes()
         if peak or on_gpu:
@@ -46,14 +46,14 @@ class Meter:
         """The scene has just been read."""
         self.parts["scene"] = max(0, resident_bytes() - self.parts["program"])
 
-    def step(self, state: StageState, material: TrainingData, uploads: Uploads) -> None:
+    def step(self, state: StageState, data: TrainingData, uploads: Uploads) -> None:
         """See what is held after a step."""
-        groups = (*vars(state.points).values(), state.frozen, state.looks)
+        groups = (*vars(state.points).values(), state.frozen, state.appearances)
         points = sum(value.nbytes for group in groups for value in group.values())
         where = self.gpu if state.points.params["means"].is_cuda else self.parts
         where["points"] = max(where["points"], points)
         self.gpu["photographs"] = max(self.gpu["photographs"], uploads.bytes)
-        for name, count in material.bytes().items():
+        for name, count in data.bytes().items():
             self.caches[name] = max(self.caches.get(name, 0), count)
 
     @contextmanager

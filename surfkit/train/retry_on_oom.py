@@ -14,7 +14,7 @@ from surfkit.train.uploads import Uploads
 Found = TypeVar("Found")
 
 
-def sparing(state: StageState, uploads: Uploads, work: Callable[[], Found]) -> Found:
+def retry_on_oom(state: StageState, uploads: Uploads, work: Callable[[], Found]) -> Found:
     """What `work` gives, which may change only the order of views and draw random numbers.
 
     Where the memory of the GPU gives out, it is done once more with what torch keeps in reserve handed back, and then

@@ -18,8 +18,10 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
-from surfkit.train.rig import CHOICE, Rig
-from surfkit.train.stage import Stage, Trainer
+from surfkit.train.neighbour_selector import CHOICE, NeighbourSelector
+from surfkit.train.next_view import neighbour
+from surfkit.train.stage import Stage
+from surfkit.train.trainer import Trainer
 
 PAIRED = {
     "l1": L1(),
@@ -44,11 +46,11 @@ def test_neighbours_stand_at_an_angle_see_the_same_and_are_as_far():
     cameras = [facing(0), facing(1), facing(9), facing(-11), facing(20), facing(70), facing(10, 9.0)]
     cameras += [facing(10, away=True), replace(facing(12), cx=-900.0)]
     depth = torch.full((30, 40), 2.0)
-    chosen = Rig.of(cameras).neighbours(0, depth)
+    chosen = NeighbourSelector.of(cameras).neighbours(0, depth)
     assert set(chosen[:2]) == {2, 3} and set(chosen[2:]) <= {4} and len(chosen) <= CHOICE
-    assert Rig.of(cameras[:2]).neighbours(0, depth) == [], "no parallax"
-    assert Rig.of(cameras).neighbours(0, torch.zeros(30, 40)) == [], "nothing rendered"
-    assert Rig.of(cameras[:1]).neighbours(0, depth) == []
+    assert NeighbourSelector.of(cameras[:2]).neighbours(0, depth) == [], "no parallax"
+    assert NeighbourSelector.of(cameras).neighbours(0, torch.zeros(30, 40)) == [], "nothing rendered"
+    assert NeighbourSelector.of(cameras[:1]).neighbours(0, depth) == []
 
 
 def test_views_that_cannot_show_the_places_are_left_out_and_no_others(monkeypatch):
@@ -61,13 +63,13 @@ def test_views_that_cannot_show_the_places_are_left_out_and_no_others(monkeypatc
         pose[:3, :3] = pose[:3, :3] @ about
         pose[:3, 3] -= pose[:3, :3] @ torch.tensor([20 * x, 20 * y, 0], dtype=torch.float64)
         cameras.append(replace(camera, world_to_camera=pose, cx=camera.cx + 60 * (off > 0.8)))
-    rig = Rig.of(cameras)
-    asked = [(at, rig.places(at, torch.full((30, 40), 2.0))) for at in range(0, 300, 20)]
-    few = [rig.worth(*pair) for pair in asked]
-    assert max(len(rig.turned_to(places)) for _, places in asked) < 100
-    monkeypatch.setattr(Rig, "turned_to", lambda rig, places: torch.arange(300))
+    selector = NeighbourSelector.of(cameras)
+    asked = [(at, selector.places(at, torch.full((30, 40), 2.0))) for at in range(0, 300, 20)]
+    few = [selector.worth(*pair) for pair in asked]
+    assert max(len(selector.turned_to(places)) for _, places in asked) < 100
+    monkeypatch.setattr(NeighbourSelector, "turned_to", lambda selector, places: torch.arange(300))
     for found, pair in zip(few, asked, strict=True):
-        assert torch.allclose(found, rig.worth(*pair), atol=1e-6) and int((found > 0).sum()) > 1
+        assert torch.allclose(found, selector.worth(*pair), atol=1e-6) and int((found > 0).sum()) > 1
 
 
 def test_the_worth_of_a_view_is_that_of_its_places():
@@ -83,7 +85,7 @@ def test_the_worth_of_a_view_is_that_of_its_places():
             ratio = float(pixel[2] / cameras[0].project(place[None])[0, 2])
             total += math.exp(-((angle - 10) ** 2) / (2 * spread**2)) * min(ratio, 1 / ratio)
     assert total > 0.5
-    assert float(Rig.of(cameras).worth(0, places)[1]) == pytest.approx(total / 4, rel=1e-5)
+    assert float(NeighbourSelector.of(cameras).worth(0, places)[1]) == pytest.approx(total / 4, rel=1e-5)
 
 
 class Counting:
@@ -176,9 +178,9 @@ def test_all_good_neighbours_take_turns(world, every):
     trainer, state = started(world, PAIRED)
     splats = trainer.primitive.activate(state.points.params, 0)
     maps = trainer.rasterizer.render(splats, trainer.views[7].camera, 0.005).maps
-    good = {trainer.views[at].name for at in trainer.rig.neighbours(7, maps.median)}
+    good = {trainer.views[at].name for at in trainer.selector.neighbours(7, maps.median)}
     turns = [
-        trainer.neighbour(replace(state, index=at), splats, 7, maps).view.name for at in range(0, 24 * every, every)
+        neighbour(trainer, replace(state, index=at), splats, 7, maps).view.name for at in range(0, 24 * every, every)
     ]
     assert len(good) > 1 and set(turns) == good
 
@@ -226,7 +228,7 @@ def mean_error(trainer, state, loss) -> float:
     values = []
     for at, view in enumerate(trainer.views):
         maps = trainer.rasterizer.render(splats, view.camera, 0.005).maps
-        second = trainer.neighbour(replace(state, index=at), splats, at, maps)
+        second = neighbour(trainer, replace(state, index=at), splats, at, maps)
         target = Target(view, trainer.photos[at] / 255, neighbour=second)
         values.append(float(loss(maps, target)))
     return sum(values) / len(values)

@@ -1,21 +1,19 @@
-"""What a step of a stage has seen of a view."""
+"""What a step of a stage knows before it changes anything."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import InView
-from surfkit.train.look import Look
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a step knows before it changes anything.
+class StepResult:
+    """A view as it is rendered, what it is compared with, and the gradients that follow.
 
     Attributes:
         target: The view and its photograph.
@@ -26,7 +24,7 @@ class Seen:
         render: The view as drawn.
         losses: Weighted value of each loss.
         gradients: By the splats.
-        look: The look of the photograph, and the gradient by it, if the stage learns any.
+        appearance: That of the photograph, with its gradient, if the stage learns any.
     """
 
     target: Target
@@ -37,4 +35,4 @@ class Seen:
     render: Render
     losses: dict[str, float]
     gradients: Gradients
-    look: tuple[Look, Tensor | None] | None
+    appearance: ImageAppearance | None

@@ -13,7 +13,7 @@ from surfkit.densify.base import Signal
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Maps, Splats
-from surfkit.train.look import Look
+from surfkit.train.image_appearance import ImageAppearance
 
 
 def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
@@ -36,30 +36,34 @@ def added(a: Maps, b: Maps) -> Maps:
     return Maps(**sums)
 
 
-def cotangents(
+def loss_gradients(
     losses: Mapping[str, Loss],
     signal: Signal,
     active: Mapping[str, float],
     maps: Maps,
     target: Target,
-    look: Look | None,
-) -> tuple[dict[str, float], Maps, Maps | None, Tensor | None]:
-    """The weighted losses; their gradient by the maps, that of those that `Signal.terms` names, and by the look."""
+    appearance: ImageAppearance | None,
+) -> tuple[dict[str, float], Maps, Maps | None]:
+    """The weighted losses; their gradient by the maps, and that of those that `Signal.terms` names.
+
+    The appearance finds its own gradient.
+    """
     terms = signal.terms
     leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
     leafy = Maps(**leaves)
-    compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
+    compared = leafy if appearance is None else replace(leafy, color=appearance.shown(leafy.color))
     compared, target = ignoring(compared, target)
     values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
     numbers = as_numbers(values)
-    by_look = None if look is None else look.gradient(list(values.values()))
+    if appearance is not None:
+        appearance.backward(list(values.values()))
     if terms is None:
         total = gradient(list(values.values()), leaves)
-        return numbers, total, total if signal.absolute else None, by_look
-    shared = look is not None or target.mask is not None  # what shows or hides pixels is before all losses
+        return numbers, total, total if signal.absolute else None
+    shared = appearance is not None or target.mask is not None  # what shows or hides pixels is before all losses
     chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
     others = gradient([value for name, value in values.items() if name not in terms], leaves)
-    return numbers, added(chosen, others), chosen, by_look
+    return numbers, added(chosen, others), chosen
 
 
 def regularizer_terms(

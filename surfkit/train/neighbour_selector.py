@@ -26,7 +26,7 @@ LEAST, WORSE = 0.1, 0.5
 
 
 @dataclass(frozen=True)
-class Rig:
+class NeighbourSelector:
     """V cameras together.
 
     Attributes:
@@ -44,7 +44,7 @@ class Rig:
     lenses: Tensor
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera]) -> Rig:
+    def of(cls, cameras: Sequence[Camera]) -> NeighbourSelector:
         """The cameras in one place."""
         poses = torch.stack([camera.world_to_camera for camera in cameras])
         rotations, shifts = poses[:, :3, :3], poses[:, :3, 3:]

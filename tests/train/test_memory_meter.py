@@ -9,7 +9,7 @@ from surfkit.core.events import MemoryTaken
 from surfkit.core.memory import peak_memory_bytes, reset_peak_memory
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.run.notes import Notes
-from surfkit.train.meter import Meter
+from surfkit.train.memory_meter import MemoryMeter
 
 LARGE = 300_000_000
 
@@ -45,11 +45,11 @@ def resettable():
 
 
 def test_each_stage_has_its_own_peak_and_the_run_the_highest(resettable, heard):
-    whole = Meter()
+    whole = MemoryMeter()
     begun = peak_memory_bytes()
     whole.tell()
     hold(LARGE)
-    part = Meter.of_stage()
+    part = MemoryMeter.of_stage()
     assert peak_memory_bytes() < begun + 0.2 * LARGE
     with part.adding("pictures"):
         hold(LARGE // 10)
@@ -70,7 +70,7 @@ def test_each_stage_has_its_own_peak_and_the_run_the_highest(resettable, heard):
 
 
 def test_parts_of_an_earlier_stage_leave_no_part_below_zero(resettable):
-    meter = Meter()
+    meter = MemoryMeter()
     meter.parts["points"] = 10**12
     report = meter.report()
     assert sum(report.values()) == 2 * report["peak"] and min(report.values()) == 0 < report["points"]
@@ -80,7 +80,7 @@ def test_nothing_is_told_of_a_peak_that_is_not_known(monkeypatch, tmp_path, hear
     monkeypatch.setattr(memory, "CLEAR", tmp_path / "none" / "clear_refs")
     monkeypatch.setattr(memory, "_passed", 0)
     hold(LARGE)
-    meter = Meter()
+    meter = MemoryMeter()
     meter.tell()
-    Meter.of_stage()
+    MemoryMeter.of_stage()
     assert meter.report() == {} and not heard

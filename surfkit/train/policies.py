@@ -1,0 +1,58 @@
+"""What the policies that add and remove points are told of a step, and what they ask for together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from surfkit.densify.base import Policy, Step
+from surfkit.primitives.edit import Edit, merge, sound, withheld
+from surfkit.primitives.points import Points
+from surfkit.train.in_view import with_frozen
+from surfkit.train.setup import StageSetup
+from surfkit.train.state import StageState
+from surfkit.train.step_result import StepResult
+from surfkit.train.views import ViewContributions
+
+
+def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
+    """What the policies are told about a step, and nothing about frozen points."""
+    stage, index, count = setup.stage, state.index + 1, len(result.shape)
+    render, gradients, in_view = result.render, result.gradients, result.in_view
+    among_all = in_view.among_all if in_view else (lambda values: values)
+    combined = stage.signal.combine(
+        gradients.signal if gradients.chosen is None else gradients.chosen, gradients.signal
+    )
+    signed_norm = among_all(lengths(gradients.signal))
+    camera = result.target.view.camera
+    drawn = result.splats if in_view is None else with_frozen(setup, state, in_view.splats, 0)
+    return Step(
+        index=index,
+        steps=stage.steps,
+        seen=among_all(render.seen[:count]),
+        splats=drawn.first(len(state.points)),
+        grad_norm=signed_norm if combined is gradients.signal else among_all(lengths(combined)),
+        radii=among_all(render.radii[:count]),
+        image_px=max(camera.width, camera.height),
+        views=ViewContributions(setup.views, setup.draws, drawn, stage.near, len(state.points)),
+        since_reset=index - state.reset_at,
+        rates={n: rate.at(index, stage.steps) / 2**state.halvings for n, rate in setup.rates.items()},
+        seed=state.seed,
+        owns=setup.owns,
+        signed_norm=signed_norm,
+        derived=gradients.derived and gradients.derived.combined(stage.signal.combine),
+    )
+
+
+def wanted(policies: Sequence[Policy], points: Points, step: Step) -> Edit | None:
+    """What the policies ask for together, of what is allowed."""
+    for policy in policies:
+        policy.watch(points, step)
+    edit = merge([sound(policy.edit(points, step), len(points), policy) for policy in policies])
+    return edit if edit is None or step.owns is None else withheld(edit, step.may_be_densified())
+
+
+def lengths(vectors: Tensor) -> Tensor:
+    """(N,) lengths of (N, 2) vectors; torch's norm takes three times as long along so short an axis."""
+    return (vectors[:, 0] ** 2 + vectors[:, 1] ** 2).sqrt()

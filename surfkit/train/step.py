@@ -1,0 +1,93 @@
+"""One optimisation step, from top to bottom: render, losses, backward, update, densify.
+
+`Trainer.step` calls the three functions in this order. The first and the last can be repeated where the memory of a GPU
+gives out (`retry_on_oom`): until they return, they change nothing but the order of views and random numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import PointsEdited, emit
+from surfkit.losses.base import RegularizerInput
+from surfkit.primitives.drawing import refuse_wrong_maps
+from surfkit.primitives.edit import Edit, apply, fitted, observe
+from surfkit.train.adam import adam_step
+from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
+from surfkit.train.image_appearance import ImageAppearance
+from surfkit.train.in_view import InView, with_frozen
+from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
+from surfkit.train.next_view import neighbour, next_target
+from surfkit.train.policies import told, wanted
+from surfkit.train.reads import GEOMETRY, maps_of_step
+from surfkit.train.setup import StageSetup
+from surfkit.train.state import StageState
+from surfkit.train.step_result import StepResult
+
+
+def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
+    """Render the next view, compare it with its photograph, and go back to the splats."""
+    stage, index = setup.stage, state.index + 1
+    at, target = next_target(setup, state)
+    camera, reads = target.view.camera, maps_of_step(setup, index)
+
+    # Render: raw parameters become splats, and these the maps that the terms of this step read.
+    in_view = InView.of_step(setup, state, camera)
+    params = state.points.all_params() if in_view is None else in_view.of_columns(state.points.params)
+    leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
+    shape = setup.primitive.activate(leaves, state.sh_degree)
+    splats = with_frozen(setup, state, shape, state.sh_degree, in_view and camera)
+    render = setup.draws.render(splats, camera, stage.near, bool(reads.keys() & GEOMETRY), "distortion" in reads)
+    refuse_wrong_maps(setup.primitive, render.maps, camera, reads)
+    setup.uploads.ahead(state.order, state.skipped)  # the next view is read while the GPU works on this one
+
+    # Losses: the maps are compared with the photograph, and with a second view where a loss wants one.
+    second = neighbour(setup, state, splats, at, render.maps) if stage.is_paired(index) else None
+    appearance = ImageAppearance.of_step(stage, state, at)
+    compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
+    losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
+
+    # Backward: from the maps to the splats; the gradient that drives densification comes beside that of all losses.
+    gradients = render.backward(total, chosen, stage.signal.absolute, len(shape))
+    return StepResult(target, in_view, leaves, shape, splats, render, losses, gradients, appearance)
+
+
+def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
+    """Move the points, and tell which ones the policies would have more or fewer of."""
+    stage, index, view, in_view = setup.stage, state.index + 1, result.target.view.name, result.in_view
+    state.whole = False  # until the step is done
+
+    # Update: terms on the points join the gradients on their way to the raw parameters, which Adam then changes.
+    seen = result.render.seen[: len(result.shape)]
+    given = index, stage.steps, result.target, result.render.maps, seen, state.points.stat, result.leaves
+    terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
+    result.losses.update(as_numbers(terms))
+    require_finite_losses(index, view, result.losses)
+    step = told(setup, state, result)
+    edit = wanted(stage.policies, state.points, step)  # policies look at the points as they were drawn
+    grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()))
+    if in_view is not None:
+        require_finite_gradients(index, view, grads)
+    if result.appearance is not None:
+        result.appearance.learn()
+    adam_step(state.points, grads, step.rates, index, in_view and in_view.rows)
+    if in_view is None:
+        require_finite_values(index, view, state.points.all_params())
+    state.points = fitted(setup.primitive, state.points)
+    return edit
+
+
+def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
+    """Drop, clone and split points, together with their moments and statistics."""
+    index = state.index + 1
+
+    # Densify: all that the policies ask for is done at once.
+    points = apply(setup.primitive, state.points, edit, state.generator)
+    if len(points) == 0:
+        raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
+    state.points = observe(setup.primitive, points, setup.views, setup.stage.near)
+    if edit.max_opacity is not None:
+        state.reset_at = index
+    if any(counts := edit.counts):
+        emit(PointsEdited(index, *counts, points=len(state.points)))

@@ -1,0 +1,84 @@
+"""The loop over the steps of a stage."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import StepDone, emit
+from surfkit.core.memory import peak_memory_bytes
+from surfkit.core.registry import name_of
+from surfkit.cuda.memory import peak_gpu_bytes
+from surfkit.losses.base import Target
+from surfkit.primitives.edit import OBSERVED_EVERY, observe
+from surfkit.primitives.points import Columns, Points
+from surfkit.raster.api import Maps
+from surfkit.train.image_appearance import fresh_appearances
+from surfkit.train.next_view import foretell
+from surfkit.train.retry_on_oom import retry_on_oom
+from surfkit.train.setup import StageSetup
+from surfkit.train.state import StageState
+from surfkit.train.step import densify, update, view_gradients
+from surfkit.train.views import Order
+from surfkit.train.watch import Stopwatch
+
+
+@dataclass(frozen=True)
+class Done:
+    """One step, for those who watch."""
+
+    index: int
+    losses: dict[str, float]
+    points: int
+    maps: Maps
+    target: Target
+
+
+@dataclass(frozen=True)
+class Trainer(StageSetup):
+    """Takes the steps of a stage."""
+
+    def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
+        """The state before the first step; `frozen` as in `StageState`."""
+        declared = set(self.primitive.columns())
+        if set(points.all_params()) != declared:
+            raise BadInput(
+                f"primitive {name_of(self.primitive)} declares the columns {', '.join(sorted(declared))}, and its "
+                f"points have {', '.join(sorted(points.all_params()))}"
+            )
+        state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
+        if self.stage.appearance is not None:
+            state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
+        state.move(self.rasterizer.where())
+        return state
+
+    def run(self, state: StageState, clock: Stopwatch | None = None) -> Iterator[Done]:
+        """Take the steps that are left; after each one, `state` can be saved, and the caller may stop.
+
+        The points of `state` are moved to where the rasterizer draws. The caller may stop the `clock` of the state.
+        """
+        clock = clock or Stopwatch(state)
+        state.move(self.rasterizer.where())
+        foretell(self, state.order)
+        while state.index < self.stage.steps:
+            done = self.step(state)
+            clock.lap()
+            held = peak_memory_bytes(), peak_gpu_bytes()
+            emit(StepDone(done.index, self.stage.steps, done.losses, done.points, *held))
+            yield done
+
+    def step(self, state: StageState) -> Done:
+        """Take one step (`train.step`). Where the memory of a GPU gives out, what can be repeated is."""
+        index = state.index + 1
+        if state.index % OBSERVED_EVERY == 0:
+            state.points = observe(self.primitive, state.points, self.views, self.stage.near)
+        state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // self.stage.sh_every))
+        result = retry_on_oom(state, self.uploads, lambda: view_gradients(self, state))
+        edit = update(self, state, result)
+        if edit is not None:
+            retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
+        state.index, state.whole = index, True
+        return Done(index, result.losses, len(state.points), result.render.maps, result.target)
