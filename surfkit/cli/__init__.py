@@ -2,8 +2,9 @@
 
 Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
 and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
-word. The module is imported by its name, which may be a keyword of Python, and only when its command is asked for, so
-`surfkit --help` loads neither torch nor tyro.
+word. The module is imported by its name, which may be a keyword of Python, and only when its command is asked for.
+So `surfkit --help` loads neither torch nor tyro. Packages add commands by the hook `surfkit_commands`; they are loaded
+for a word that is none of ours.
 """
 
 from __future__ import annotations
@@ -62,6 +63,8 @@ BEGIN = (
     "checks one that is there."
 )
 """What `surfkit --help` says to those who are new."""
+MORE = "`surfkit help COMMAND` tells more. `surfkit plugins` lists the commands that packages add."
+"""What it ends with."""
 RESUMED = ("train", "tune", "prepare", "ablate", "maps", "texture", "render")
 """Commands that go on with what an interrupted one has done."""
 MEMORY_ADVICE = {
@@ -131,9 +134,26 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`surfkit help COMMAND` tells more.",
+            textwrap.fill(MORE, width),
         ]
     )
+
+
+def added_commands() -> dict[str, type]:
+    """The commands of packages, by the word that users type.
+
+    Raises:
+        BadInput: Two packages offer one under the same name, or one has the name of a command of surfkit.
+    """
+    from surfkit.core.registry import offered_once
+
+    found = offered_once("surfkit_commands", "a command")
+    if taken := sorted(found.keys() & COMMANDS.keys()):
+        raise BadInput(
+            f"a package offers a command named {taken[0]!r}, which surfkit has (`surfkit plugins` lists them); "
+            "uninstall it, or leave it out with SURFKIT_PLUGINS=none"
+        )
+    return found
 
 
 def _helped(words: list[str]) -> int:
@@ -212,11 +232,14 @@ def _dispatch(words: list[str]) -> int:
         print(f"surfkit {own_version()}")
         return 0
     name, *rest = words
-    if name not in COMMANDS:
-        raise BadInput(f"no command {name!r}; {_meant(name, COMMANDS)}commands: {', '.join(COMMANDS)}")
-    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     from surfkit.cli.parse import parse
 
+    if name not in COMMANDS:
+        known = [*COMMANDS, *(added := added_commands())]
+        if name not in added:
+            raise BadInput(f"no command {name!r}; {_meant(name, known)}commands: {', '.join(known)}")
+        return parse(added[name], rest, f"surfkit {name}").run() or 0
+    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     if isinstance(command, dict):
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."

@@ -23,6 +23,7 @@ class Plugins:
             "surfkit_recipes": "recipe:",
             "surfkit_tables": "table:",
             "surfkit_rows": "rows of table:",
+            "surfkit_commands": "command ",
         }
         for hook, prefix in prefixes.items():  # before `records`, which then knows what failed here
             for owner, name, _ in offered(hook):

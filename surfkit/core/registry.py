@@ -61,6 +61,14 @@ class Hooks:
         """Return rows that this package adds to tables that are there, a sequence by the name of the table."""
 
     @hookspec
+    def surfkit_commands(self) -> Mapping[str, type]:
+        """Return the commands this package adds to `surfkit`, by the word that users type.
+
+        Each is a dataclass: its docstring and its fields are the help, and `run()` does the work and returns an exit
+        status, or None for 0.
+        """
+
+    @hookspec
     def surfkit_event(self, event: Any) -> None:
         """See one event of a run: a stage began, a step ended, a file was written."""
 
@@ -310,6 +318,11 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
         wrong = [item for item in items if not is_dataclass(item) or isinstance(item, type)]
         if wrong or (hook == "surfkit_rows" and items == [value]):
             raise BadInput(f"{name!r} is {repr(value)[:80]}, and not {KINDS[hook]}")
+    if hook == "surfkit_commands":
+        if not (isinstance(value, type) and is_dataclass(value) and callable(getattr(value, "run", None))):
+            raise BadInput(f"{name!r} is {repr(value)[:80]}, and not a dataclass with a method run()")
+        if not (value.__doc__ or "").strip() or (value.__doc__ or "").startswith(f"{value.__name__}("):
+            raise BadInput(f"{_where(value)} has no docstring; its first line is what `surfkit --help` shows")
     if hook != "surfkit_components":
         return
     if not (isinstance(value, type) and issubclass(value, Component)):
