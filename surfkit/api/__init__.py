@@ -16,6 +16,7 @@ from surfkit.api.run import TrainedRun, open_run
 from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.core.events import say
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.recipe import Recipe, complete
@@ -72,7 +73,10 @@ def train(
     chosen = get_recipe(recipe)
     given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
     if steps is None and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
-        steps = chosen.start.usual_steps(len(given.train), torch_device(device).type == "cuda")
+        count = len(given.train)
+        steps = chosen.start.usual_steps(count, torch_device(device).type == "cuda")
+        if steps is not None:
+            say(f"steps: {steps:,}, as there are {count:,} photographs to train on; steps= changes it")
     chosen = chosen if steps is None else pipeline.with_steps(chosen, steps)
     with listening(on_step):
         pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache))
