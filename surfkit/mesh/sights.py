@@ -167,7 +167,8 @@ def for_all(sights: Sights, what: str, each: Each, places: np.ndarray | None = N
     """Call `each` with every sight, or those that may see some of (N, 3) places, and report progress."""
     looking = range(len(sights))
     if places is not None:
-        looking = [at for at in looking if len(places) and may_see(sights.cameras[at], places.min(0), places.max(0))]
+        ends = (places.min(0), places.max(0)) if len(places) else None
+        looking = [at for at in looking if ends and may_see(sights.cameras[at], *ends)]
     for done, at in enumerate(looking, 1):
         each(sights[at])
         emit(Progress(what, done, len(looking)))
