@@ -93,7 +93,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = ["__version__", "train", *_OTHER_NAMES, *_MODULE_OF]  # noqa: PLE0604
 
 
-class Callable(ModuleType):
+class TrainFolder(ModuleType):
     """The folder `surfkit.train`, which is the function `surfkit.api.train` too."""
 
     def __call__(self, *words: Any, **settings: Any) -> Any:

@@ -61,7 +61,8 @@ def train(
         recipe: Its name, its file, or itself.
         scene: The data set.
         out: Run folder.
-        steps: Optimisation steps; schedules are scaled along. By default as `surfkit train` has it.
+        steps: Optimisation steps; schedules are scaled along. By default those of the recipe; where these are as always
+            and its start knows how many suit the number of photographs, so many, which is said.
         device: For training and drawing: "auto", "cpu", "cuda", "cuda:1", or a rasterizer by its name.
         on_step: Called after each step.
         cache: Memory for photographs, such as "4GB".
@@ -70,9 +71,9 @@ def train(
         BadInput: Wrong settings or data, or `out` holds another run.
         Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
     """
-    chosen = get_recipe(recipe)
+    chosen, is_file = get_recipe(recipe), str(recipe).endswith(".json")
     given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
-    if steps is None and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
+    if steps is None and not is_file and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
         count = len(given.train)
         steps = chosen.start.usual_steps(count, torch_device(device).type == "cuda")
         if steps is not None:

@@ -24,8 +24,8 @@ class Mesh:
     Attributes:
         vertices: (V, 3) float64.
         faces: (F, 3) int32, counter-clockwise from outside.
-        colors: (V, 3) uint8, or None.
-        values: Of the vertices, by name: (V,) float32.
+        colors: (V, 3) uint8; None where the file is no PLY or has none.
+        values: Of the vertices, by name: (V,) float32; see `surfkit.mesh.base.VALUES`. None of files that are no PLY.
         path: The file that it was read from.
     """
 
@@ -91,5 +91,7 @@ class Figures:
         for name in names:
             found = found.get(name) if isinstance(found, Mapping) else None
         if found is None:
-            raise BadInput(f"{names[-1]} was not measured; evaluate() measures photographs, evaluate(gt=FILE) the mesh")
+            raise BadInput(
+                f"{names[-1]} was not measured; evaluate() measures held-out photographs, evaluate(gt=FILE) the mesh"
+            )
         return float(found["mean"] if isinstance(found, Mapping) else found)

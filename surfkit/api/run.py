@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -30,24 +29,26 @@ from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, note_metrics
+from surfkit.run.folder import note_metrics
+from surfkit.run.journal import record_events
 from surfkit.run.lod import load_levels
 from surfkit.run.measure import evaluate
 from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
-from surfkit.run.method import refuse_not_drawn, splats_of
+from surfkit.run.method import refuse_mesher, refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.scene.camera import Camera
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import View
 from surfkit.train.bars import bars
+from surfkit.train.faults import full_disk_in_one_line
 
 
 def open_run(out: str | Path, *, device: Device = "auto") -> TrainedRun:
-    """A finished run in a folder.
+    """A finished run in a folder. That it is finished, and its data are unchanged, is looked at when it is first used.
 
     Raises:
-        BadInput: It holds no run, or one that is not finished, or its data have changed since.
+        BadInput: It holds no run.
     """
     return TrainedRun(Path(out), device)
 
@@ -137,21 +138,34 @@ class TrainedRun:
             settings: Of the mesher (`voxel=0.2`), and of what is written (`triangles=100_000`, `watertight=True`).
 
         Raises:
-            BadInput: A setting that neither has, or there is no surface.
+            BadInput: A setting that neither has, or there is no surface, or a mesher where the method has made
+                the mesh itself.
         """
         ctx, made = self._loaded
         run, scene = ctx.run, ctx.scene
         written = {each.name for each in fields(MeshOutput)}
         output = MeshOutput(**{name: value for name, value in settings.items() if name in written})
-        chosen = _mesher(mesher, self.recipe.mesh or TSDF())
-        for name, value in settings.items():
-            if name not in written:
-                chosen = evolve(chosen, name, value)
-        chosen.ready()
-        with collect_notes(), bars(), locked(run.out), _maps(run, made, chosen, ctx, self.device) as with_maps:
-            what = mesh_input(with_maps, made, scene, ctx.rasterizer, cache_bytes(memory, "memory"), chosen)
-            make_mesh(with_maps, chosen if made.mesh is None else made.mesh, output, what, made.last_steps)
-        return Mesh.read(run.out / "mesh.ply" if "ply" in output.formats else run.out / f"mesh.{output.formats[0]}")
+        own = {name: value for name, value in settings.items() if name not in written}
+        if mesher is not None or own:
+            refuse_mesher(run.out)
+        chosen = None if made.mesh is not None else _mesher(mesher, self.recipe.mesh or TSDF())
+        for name, value in own.items():
+            chosen = evolve(chosen, name, value)
+        if chosen is not None:
+            chosen.ready()
+        budget = cache_bytes(memory, "memory")
+        maps = nullcontext(run) if chosen is None else with_maps_to_mesh(run, chosen, scene, ctx.caches, self.device)
+        with (
+            collect_notes(),
+            bars(),
+            locked(run.out),
+            full_disk_in_one_line(run.out),
+            maps as with_maps,
+            record_events(run.out),
+        ):
+            what = mesh_input(with_maps, made, scene, ctx.rasterizer, budget, chosen)
+            record = make_mesh(with_maps, chosen or made.mesh, output, what, made.last_steps)
+        return Mesh.read(run.out / record["files"][0])
 
     def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:
         """Measure: on the held-out photographs, or the run's mesh against the truth.
@@ -162,20 +176,31 @@ class TrainedRun:
 
         Raises:
             BadInput: Nothing to measure, or files that do not belong together.
+
+        Returns:
+            What was measured now; `metrics` has what was measured before, too.
         """
         ctx, made = self._loaded
-        with collect_notes(), bars(), locked(ctx.run.out):
+        run = ctx.run
+        with collect_notes(), bars(), locked(run.out), full_disk_in_one_line(run.out):
             if gt is None:
                 if settings:
                     raise BadInput(f"evaluate: {next(iter(settings))} has no effect without gt; leave it out")
-                return Figures(evaluate(ctx.run, made, ctx.scene))
+                refuse_not_drawn(run)
+                found = evaluate(run, made, ctx.scene)
+                return Figures({name: value for name, value in found.items() if name not in ("geometry", "mesh")})
             known = [each.name for each in fields(Comparison)]
             for name in settings:
                 if name not in known:
                     raise BadInput(f"evaluate: {unknown('setting', name, known)}")
-            pair, folder = (ctx.run.mesh, Path(gt)), ctx.run.out / "geometry"
-            found = measure_geometry(pair, Comparison(**settings), folder, ctx.scene.train, ctx.scene.frame)
-            return Figures(note_metrics(ctx.run.metrics, found))
+            if not (run.mesh.exists() and run.mesh_record.exists()):
+                raise BadInput(f"{run.out}: no {run.mesh.name} of its model in it; mesh() makes it")
+            folder = run.out / "geometry"
+            found = measure_geometry(
+                (run.mesh, Path(gt)), Comparison(**settings), folder, ctx.scene.train, ctx.scene.frame
+            )
+            note_metrics(run.metrics, found)
+            return Figures(found)
 
     def export(self, path: str | Path, format: str | Format | None = None) -> Path:  # noqa: A002 (the word that fits)
         """Write the splats to a file for other programs.
@@ -205,16 +230,6 @@ def _mesher(given: str | Mesher | None, default: Mesher) -> Mesher:
     if given is None or isinstance(given, Mesher):
         return given or default
     return find(Mesher, given.removeprefix("mesh:"))()
-
-
-@contextmanager
-def _maps(run: Run, made: Reconstruction, mesher: Mesher, ctx: RunContext, device: Device) -> Iterator[Run]:
-    """Within, the run with the depth maps that a mesher needs."""
-    if made.mesh is not None:
-        yield run
-        return
-    with with_maps_to_mesh(run, mesher, ctx.scene, ctx.caches, device) as with_maps:
-        yield with_maps
 
 
 def _format_of(path: Path) -> Format:

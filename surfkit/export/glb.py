@@ -81,9 +81,7 @@ def linear_colors(srgb: np.ndarray) -> np.ndarray:
     return colors
 
 
-def glb(
-    where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str, spaced: bool = False
-) -> Iterator[bytes]:
+def glb(where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str) -> Iterator[bytes]:
     """A document with its bytes, as a GLB file has them, part after part.
 
     Args:
@@ -91,7 +89,6 @@ def glb(
         document: Without buffers, bufferViews and accessors, which are added.
         blocks: Of these.
         remedy: What to do where it is too large, for the message.
-        spaced: Whether spaces follow the commas and colons of the JSON, as they always have in meshes.
 
     Raises:
         BadInput: More than 4 GiB; before anything else.
@@ -99,7 +96,7 @@ def glb(
     if blocks.views:
         buffers = {"buffers": [{"byteLength": blocks.length}], "bufferViews": blocks.views}
         document = {**document, **buffers, "accessors": blocks.accessors}
-    text = json.dumps(document, separators=None if spaced else (",", ":")).encode()
+    text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + (8 + blocks.length if blocks.views else 0)
     if total > MOST_BYTES:
@@ -113,10 +110,10 @@ def glb(
         yield data + b"\0" * (-len(data) % 4)
 
 
-def write_glb(path: Path, document: dict[str, Any], blocks: Blocks, remedy: str, spaced: bool = False) -> None:
+def write_glb(path: Path, document: dict[str, Any], blocks: Blocks, remedy: str) -> None:
     """Save what `glb` gives as a file, which appears only when it is complete."""
     with replacing(path) as file:
-        file.writelines(glb(path, document, blocks, remedy, spaced))
+        file.writelines(glb(path, document, blocks, remedy))
 
 
 def read_glb(path: Path) -> Document:

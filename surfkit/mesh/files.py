@@ -106,7 +106,7 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
     }
-    write_glb(path, document, blocks, "simplify the mesh, with --triangles", spaced=True)
+    write_glb(path, document, blocks, "simplify the mesh, with --triangles")
     beside = Path(f"{path}.json")
     up = "y: the file turns z up to y up" if frame.crs else "as in the input"
     write_json(beside, {"offset": list(frame.shift), "metres_per_unit": frame.metres, "crs": frame.crs, "up": up})

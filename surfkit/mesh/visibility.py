@@ -237,9 +237,8 @@ class Visibility(Mesher):
         parts = tiles(points.places, most, HALO * side)
         if (largest := max(len(tile.rows) for tile in parts)) > most:
             needed, given = (f"{count * POINT_BYTES / 1e9:.1f} GB" for count in (largest, most))
-            emit(
-                Warned(f"the least that can be meshed at once needs about {needed}, and {given} may be used: --memory")
-            )
+            told = f"one tile needs about {needed}, more than the {given} of --memory; a larger --mesh.cell needs less"
+            emit(Warned(told))
         for tile in parts:
             found.append(self.cut(sights, points.take(tile.rows), side, tile, decided))
         faces = np.concatenate(found)

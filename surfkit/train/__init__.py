@@ -4,4 +4,4 @@ import sys
 
 import surfkit
 
-sys.modules[__name__].__class__ = surfkit.Callable
+sys.modules[__name__].__class__ = surfkit.TrainFolder

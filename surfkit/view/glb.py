@@ -30,4 +30,4 @@ def unlit_glb(mesh: Mesh) -> bytes:
         "materials": [{"doubleSided": True, "extensions": {UNLIT: {}}}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
     }
-    return b"".join(glb("the mesh", document, blocks, "show fewer triangles", spaced=True))
+    return b"".join(glb("the mesh", document, blocks, "show fewer triangles"))

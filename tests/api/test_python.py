@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,13 +117,28 @@ def test_a_step_may_stop_the_run(folder, tmp_path):
 def test_what_is_wrong_is_said_in_one_line(page, folder, wrong, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = surfkit.open(folder / "RUN")
-    if "f1" in said:
-        run.metrics.pop("geometry", None)
-        path = folder / "RUN" / "metrics.json"
-        path.write_text(json.dumps({name: it for name, it in run.metrics.items() if name != "geometry"}))
     with pytest.raises(surfkit.BadInput, match=said) as error:
         wrong(folder / "scene", run)
     assert "\n" not in str(error.value)
+
+
+def test_what_was_measured_before_is_not_given_as_new(page, folder):
+    run = surfkit.open(folder / "RUN")
+    assert "geometry" in run.metrics and "geometry" not in run.evaluate().metrics
+
+
+def test_a_mesh_that_the_method_made_takes_no_mesher(page, folder, monkeypatch):
+    run = surfkit.open(folder / "RUN")
+    ctx, made = run._loaded
+    run.__dict__["_loaded"] = ctx, replace(made, mesh=object())
+
+    def refuse(out):
+        raise surfkit.BadInput("made its mesh itself")
+
+    monkeypatch.setattr("surfkit.api.run.refuse_mesher", refuse)
+    for given in ({"mesher": "tsdf"}, {"voxel_px": 2.0}):
+        with pytest.raises(surfkit.BadInput, match="made its mesh itself"):
+            run.mesh(**given)
 
 
 def test_train_is_a_function_and_a_folder():

@@ -166,14 +166,14 @@ def test_a_glb_file_byte_for_byte(tmp_path, monkeypatch):
     corners, path = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32), tmp_path / "mesh.glb"
     write_mesh(path, Mesh(corners, np.array([[0, 1, 2]], np.int32)), Frame(np.zeros(3), 1.0))
     text = (
-        b'{"asset": {"version": "2.0", "generator": "surfkit 1.2.3"}, "scene": 0, "scenes": [{"nodes": [0]}], '
-        b'"nodes": [{"mesh": 0}], "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, '
-        b'"doubleSided": true}], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, '
-        b'"material": 0}]}], "buffers": [{"byteLength": 48}], "bufferViews": [{"buffer": 0, "byteOffset": 0, '
-        b'"byteLength": 36, "target": 34962, "byteStride": 12}, {"buffer": 0, "byteOffset": 36, "byteLength": 12, '
-        b'"target": 34963}], "accessors": [{"bufferView": 0, "count": 3, "componentType": 5126, "type": "VEC3", '
-        b'"min": [0.0, 0.0, 0.0], "max": [1.0, 2.0, 0.0]}, {"bufferView": 1, "count": 3, "componentType": 5125, '
-        b'"type": "SCALAR"}]}'
+        b'{"asset":{"version":"2.0","generator":"surfkit 1.2.3"},"scene":0,"scenes":[{"nodes":[0]}],'
+        b'"nodes":[{"mesh":0}],"materials":[{"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},'
+        b'"doubleSided":true}],"meshes":[{"primitives":[{"attributes":{"POSITION":0},"indices":1,'
+        b'"material":0}]}],"buffers":[{"byteLength":48}],"bufferViews":[{"buffer":0,"byteOffset":0,'
+        b'"byteLength":36,"target":34962,"byteStride":12},{"buffer":0,"byteOffset":36,"byteLength":12,'
+        b'"target":34963}],"accessors":[{"bufferView":0,"count":3,"componentType":5126,"type":"VEC3",'
+        b'"min":[0.0,0.0,0.0],"max":[1.0,2.0,0.0]},{"bufferView":1,"count":3,"componentType":5125,'
+        b'"type":"SCALAR"}]}'
     )
     text += b" " * (-len(text) % 4)
     data = struct.pack("<9f3I", *corners.ravel(), 0, 1, 2)

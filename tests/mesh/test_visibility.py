@@ -209,7 +209,7 @@ def test_points_are_the_same_however_many_boxes_they_are_gathered_in():
 def test_too_little_memory_is_told(monkeypatch):
     mesh, listener = meshed_with(subject(CAMERAS, torus, budget_bytes=1_000_000), monkeypatch, halo=100.0)
     assert open_or_crowded(mesh) == 0
-    assert [text for text in listener.told if "can be meshed at once needs about" in text]
+    assert [text for text in listener.told if "one tile needs about" in text]
 
 
 @pytest.mark.parametrize(
