@@ -102,9 +102,7 @@ def main() -> None:
     """Measure all, each in a process of its own, and keep the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--across", type=int, default=6, help="views along a side of the small scene")
-    parser.add_argument(
-        "--budget", type=float, default=1.5e8, help="bytes; the small scene is cut too"
-    )
+    parser.add_argument("--budget", type=float, default=1.5e8, help="bytes; the small scene is cut too")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
