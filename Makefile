@@ -37,7 +37,7 @@ fuzz: $(VENV)/.installed
 	$(PY) bench/fuzz.py --cases 10000
 
 # Reinstalled when what is compiled or declared changes; the Python files are used in place.
-$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/*/*.h surfkit/native/*.cpp surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)
+$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/*/*.h surfkit/raster/native/*.cpp surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
 	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev,docs]"

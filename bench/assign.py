@@ -21,9 +21,9 @@ from torch import Tensor
 from trained import halfway
 
 from surfkit.core.tree import evolve
+from surfkit.io.datasets.data import Data
 from surfkit.partition import CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid, SSIMDifference
-from surfkit.readers.data import Data
-from surfkit.recipes.city import COARSE
+from surfkit.study.recipes.city import COARSE
 
 CUTS: dict[str, Partition] = {"contracted 2x2": ContractedGrid((2, 2)), "quantile 3x3": QuantileGrid((3, 3))}
 THRESHOLDS = [at / 1_000 for at in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45, 50, 60, 80, 100, 150)]

@@ -26,30 +26,30 @@ SIDE_M, ACROSS, MARGIN_M = 100.0, 5, 2.5
 """Metres of a tile, cameras along it, and metres of points around the scene, so that views on its rim show no less."""
 WIDTH, HEIGHT = 640, 480
 HERE = Path(__file__).parents[1]
-PROGRAM = "import surfkit.cli.tune, surfkit.core.memory as m"
+PROGRAM = "import surfkit.apps.tune, surfkit.core.memory as m"
 
 MAKE = """
 import sys, torch
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks.block import Record, load_blocks
-from surfkit.blocks.schedule import extract_views
+from surfkit.runs.blocks.block import Record, load_blocks
+from surfkit.runs.blocks.schedule import extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
-from surfkit.run.folder import Run
-from surfkit.run.stage import Intervals
+from surfkit.runs.folder import Run
+from surfkit.runs.stage import Intervals
 from surfkit.partition import CoarseModel, QuantileGrid
 from surfkit.partition.plan import Plan, blocks_of
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 from surfkit.train.views import Order
-from surfkit.run.context import RunContext
+from surfkit.runs.context import RunContext
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 data = Data(Path(sys.argv[1]), test_every=0)
@@ -73,18 +73,18 @@ FINISH = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks.block import load_blocks, read_plan
-from surfkit.pipeline import opened
+from surfkit.runs.blocks.block import load_blocks, read_plan
+from surfkit.runs.pipeline import opened
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.readers.read import read
+from surfkit.io.datasets.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.state import StageState
 from surfkit.train.views import Order
-from surfkit.run.stage import Intervals
-from surfkit.blocks.worker import Start
-from surfkit.run.context import RunContext
+from surfkit.runs.stage import Intervals
+from surfkit.runs.blocks.worker import Start
+from surfkit.runs.context import RunContext
 import torch
 
 this = opened(Path(sys.argv[1]))
@@ -156,14 +156,14 @@ def measured(tiles: int, points: int, steps: int) -> dict[str, float]:
 
 def merge(out: Path) -> None:
     """Put the blocks of a run together, as its driver does."""
-    from surfkit.blocks.block import load_blocks, read_plan
-    from surfkit.blocks.merge import merge_blocks
-    from surfkit.blocks.worker import open_coarse_model
-    from surfkit.pipeline import opened
+    from surfkit.io.datasets import extract
     from surfkit.raster.select import select
-    from surfkit.readers import extract
-    from surfkit.run.context import RunContext
-    from surfkit.run.stage import Intervals
+    from surfkit.runs.blocks.block import load_blocks, read_plan
+    from surfkit.runs.blocks.merge import merge_blocks
+    from surfkit.runs.blocks.worker import open_coarse_model
+    from surfkit.runs.context import RunContext
+    from surfkit.runs.pipeline import opened
+    from surfkit.runs.stage import Intervals
     from surfkit.train.data_cache import CacheSettings
 
     run = opened(out)

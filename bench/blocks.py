@@ -18,23 +18,23 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks.block import load_blocks
-from surfkit.blocks.schedule import Compute, extract_views, load_or_make_plan, train_waiting
-from surfkit.blocks.worker import open_coarse_model
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
-from surfkit.execute import Pool
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.partition import Balanced, CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid
 from surfkit.partition.plan import Fewest, plan
-from surfkit.pipeline import run, with_steps
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
-from surfkit.run.context import RunContext
-from surfkit.run.folder import Run
-from surfkit.run.stage import Intervals
+from surfkit.runs.blocks.block import load_blocks
+from surfkit.runs.blocks.schedule import Compute, extract_views, load_or_make_plan, train_waiting
+from surfkit.runs.blocks.worker import open_coarse_model
+from surfkit.runs.context import RunContext
+from surfkit.runs.execute import Pool
+from surfkit.runs.folder import Run
+from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.stage import Intervals
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.data_cache import CacheSettings

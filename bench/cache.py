@@ -20,11 +20,11 @@ from pathlib import Path
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
-from surfkit.pipeline import Intervals, run, with_steps
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import Intervals, run, with_steps
 from surfkit.train.data_cache import CacheSettings
 
 TIMES = ("seconds", "cpu_seconds")

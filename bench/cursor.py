@@ -25,18 +25,18 @@ from machine import save
 from view import SIZE, city
 from viser import transforms
 
+from surfkit.apps.view.measure import coordinates
+from surfkit.apps.view.page import first_view
+from surfkit.apps.view.screen import WORLD, ray_through
+from surfkit.apps.view.server import Address, served
+from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.subject import Points, Subject
 from surfkit.mesh.base import Mesh
-from surfkit.method.base import Reconstruction
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.select import select
-from surfkit.run.method import with_drawing
+from surfkit.runs.method import with_drawing
+from surfkit.runs.methods.base import Reconstruction
 from surfkit.scene.scene import Frame
-from surfkit.view.measure import coordinates
-from surfkit.view.page import first_view
-from surfkit.view.screen import WORLD, ray_through
-from surfkit.view.server import Address, served
-from surfkit.view.shelf import Shelf
-from surfkit.view.subject import Points, Subject
 
 UP = np.array([0.0, 0.0, 1.0])
 FRAME = Frame(np.array([492_000.0, 5_260_000.0, 430.0]), 0.01, 1.0, "EPSG:32632")

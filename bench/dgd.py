@@ -15,7 +15,7 @@ from machine import save
 from trained import copied, halfway
 
 from surfkit.densify.signal import AbsGradient, LossGradient
-from surfkit.recipes import SURFELS
+from surfkit.study.recipes import SURFELS
 from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer
 

@@ -16,14 +16,14 @@ from pathlib import Path
 
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Compute
+from surfkit.apps.doctor.examine import examine
+from surfkit.apps.doctor.forecast import Plan, forecast
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
-from surfkit.doctor.examine import examine
-from surfkit.doctor.forecast import Plan, forecast
-from surfkit.pipeline import run, with_steps
-from surfkit.readers.data import Data
-from surfkit.run.stage import Intervals
+from surfkit.io.datasets.data import Data
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.stage import Intervals
 
 
 def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:

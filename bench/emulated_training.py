@@ -15,19 +15,19 @@ from pathlib import Path
 import torch
 from machine import save
 
-from surfkit.cuda.emulated import Emulated
 from surfkit.densify.adc import ADC
 from surfkit.densify.signal import LossGradient
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.psnr import psnr
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene
 from surfkit.testing.simulated_gpu import GPU, simulated_gpu

@@ -23,6 +23,8 @@ from surfkit.evaluate.geometry.comparison import Comparison, make_side, truth_si
 from surfkit.evaluate.geometry.repetition import Measurement
 from surfkit.evaluate.geometry.scores import nearest, shares, tree
 from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh, MeshInput
 from surfkit.mesh.clean import clean
@@ -32,8 +34,6 @@ from surfkit.mesh.stereo import points
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 from surfkit.raster.reference import Reference
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
 from surfkit.scene.scene import Frame, Scene, View
 
 ROWS = {

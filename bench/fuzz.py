@@ -39,9 +39,8 @@ def main() -> int:
     os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE", SURFKIT_PLUGINS="none")
     import torch.fx.experimental.symbolic_shapes  # noqa: F401  (slow ones, loaded once: processes are forked from here)
 
-    from surfkit import pipeline  # noqa: F401
     from surfkit.cli.recipes import recipes
-    from surfkit.readers.capture import load_pycolmap
+    from surfkit.io.datasets.capture import load_pycolmap
 
     recipes(), load_pycolmap()
     found: dict[tuple[str, str], Finding] = {}

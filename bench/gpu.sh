@@ -10,6 +10,6 @@ from surfkit.raster.cuda.gpu import CudaRasterizer
 sys.exit(f"bench/gpu.sh: {why}" if (why := CudaRasterizer().missing()) else 0)
 CHECK
 status=0
-timeout 240 "$python" -m pytest -m cuda tests/cuda tests/raster tests/train || status=$?
+timeout 240 "$python" -m pytest -m cuda tests/raster/nvrtc tests/raster tests/train || status=$?
 timeout 300 "$python" bench/gpu.py "$@" || status=$?
 exit $status

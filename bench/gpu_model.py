@@ -23,9 +23,6 @@ from machine import save
 from scenes import city
 
 from surfkit.compress.cuda import codes
-from surfkit.cuda.emulated import Emulated
-from surfkit.cuda.nvrtc import nvrtc, resources
-from surfkit.cuda.source import Source
 from surfkit.mesh.cuda import grid
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.lattice import Lattice, Picture
@@ -33,6 +30,9 @@ from surfkit.raster.api import Maps
 from surfkit.raster.cuda import ssim
 from surfkit.raster.cuda.rasterizer import TileRasterizer
 from surfkit.raster.cuda.rasterizer import source as raster_source
+from surfkit.raster.nvrtc.emulated import Emulated
+from surfkit.raster.nvrtc.nvrtc import nvrtc, resources
+from surfkit.raster.nvrtc.source import Source
 from surfkit.scene.camera import Camera
 from surfkit.train import adam
 

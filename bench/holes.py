@@ -28,16 +28,16 @@ import torch
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from surfkit.apps.maps.contours import contour_lines, even_interval
+from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.ours import RECORD
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.evaluate.mesh.edges import boundary_edges
 from surfkit.evaluate.mesh.whole import whole_mesh
-from surfkit.maps.contours import contour_lines, even_interval
-from surfkit.maps.grid import Grid, Window
-from surfkit.maps.ours import RECORD
-from surfkit.pipeline import opened
-from surfkit.run.resume import read_unchanged
+from surfkit.runs.pipeline import opened
+from surfkit.runs.resume import read_unchanged
 from surfkit.scene.scene import Frame, View
 
 ENOUGH = 3

@@ -14,11 +14,11 @@ from pathlib import Path
 import torch
 from machine import save
 
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
-from surfkit.recipes import RECIPES
 from surfkit.scene.photos import view_photo
+from surfkit.study.recipes import RECIPES
 from surfkit.train import checkpoint
 from surfkit.train.in_view import InView
 from surfkit.train.trainer import Trainer

@@ -96,9 +96,8 @@ def load_all() -> None:
     import torch.fx.experimental.symbolic_shapes  # noqa: F401
     from PIL import Image
 
-    from surfkit import pipeline  # noqa: F401
     from surfkit.cli.recipes import recipes
-    from surfkit.readers.capture import load_pycolmap
+    from surfkit.io.datasets.capture import load_pycolmap
 
     recipes()
     load_pycolmap()

@@ -25,23 +25,23 @@ from statistics import median
 import torch
 from machine import save
 
-sys.path += [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "view")]
+sys.path += [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "apps" / "view")]
 from browser import Browser
 
-from surfkit.blocks.schedule import Compute
+from surfkit.apps.view.control import Control
+from surfkit.apps.view.live import Live, live_view
+from surfkit.apps.view.server import Address
 from surfkit.cli.recipes import recipes
-from surfkit.pipeline import run, with_steps
+from surfkit.io.datasets.data import Data
 from surfkit.primitives.points import Points
-from surfkit.readers.data import Data
-from surfkit.run.stage import Intervals
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
 from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
-from surfkit.view.control import Control
-from surfkit.view.live import Live, live_view
-from surfkit.view.server import Address
 
 WAYS = ("no page", "nobody looks", "somebody looks")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from surfkit import native
+from surfkit.raster import native
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -21,10 +21,10 @@ import torch
 from scipy import ndimage
 
 from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.mesh.shade import draw_faces
 from surfkit.raster.psnr import psnr
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
 from surfkit.scene.photos import view_photo
 
 HALF, REACH, AROUND = 12, 4, 8

@@ -24,11 +24,11 @@ from machine import save
 from playwright.sync_api import Page, sync_playwright
 from view import QUIET, RENDERER, SIZE, SOFTWARE, city
 
+from surfkit.apps.view.page import show
+from surfkit.apps.view.server import Address, served
+from surfkit.apps.view.subject import Points, Subject
 from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
-from surfkit.view.page import show
-from surfkit.view.server import Address, served
-from surfkit.view.subject import Points, Subject
 
 COUNTING = """
 window.drawn = [];

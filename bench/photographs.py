@@ -18,15 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher
+from surfkit.apps.sfm.prepare import Preparation
+from surfkit.apps.sfm.settings import Settings
+from surfkit.apps.sfm.similarity import umeyama
 from surfkit.core.registry import find
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
-from surfkit.run.notes import collect_notes
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.runs.notes import collect_notes
 from surfkit.scene.earth import from_utm
-from surfkit.sfm.base import FeatureExtractor, FeatureMatcher
-from surfkit.sfm.prepare import Preparation
-from surfkit.sfm.settings import Settings
-from surfkit.sfm.similarity import umeyama
 from surfkit.testing.exif import write_exif
 
 PLACE = np.array([512_000.0, 5_800_000.0, 100.0])

@@ -12,9 +12,9 @@ import torch
 from machine import cpu_seconds, save
 from scenes import city
 
-from surfkit.native import module
 from surfkit.raster.api import MAPS, Maps
-from surfkit.raster.native import NativeRasterizer, _Pass
+from surfkit.raster.compiled import NativeRasterizer, _Pass
+from surfkit.raster.native import module
 from surfkit.raster.ssim import ssim
 from surfkit.train.adam import update
 

@@ -25,14 +25,14 @@ from surfkit.compress.container import read_model, write_model
 from surfkit.compress.packed import Packed
 from surfkit.compress.plain import Float16
 from surfkit.core.registry import find
-from surfkit.export.base import Format
-from surfkit.pipeline import loaded
+from surfkit.io.splats.base import Format
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.psnr import psnr
-from surfkit.run.context import RunContext
-from surfkit.run.method import splats_of
+from surfkit.runs.context import RunContext
+from surfkit.runs.method import splats_of
+from surfkit.runs.pipeline import loaded
 from surfkit.scene.photos import view_photo
 
 FORMATS = ("ply", "compressed-ply", "splat", "spz", "sog")

@@ -32,8 +32,8 @@ from PIL import Image
 
 from surfkit.depth import PatchMatch, PlaneSweep
 from surfkit.depth.base import DepthEstimator, DepthInput
-from surfkit.readers.data import Data
-from surfkit.readers.read import observations, read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import observations, read
 from surfkit.scene.scene import Frame, Scene, View
 
 PACK = Path(__file__).resolve().parents[1].parent / "shared/data/shibuya-synth"

@@ -16,7 +16,7 @@ from machine import save
 from trained import copied, halfway
 
 from surfkit.losses.base import Target
-from surfkit.recipes import SURFELS
+from surfkit.study.recipes import SURFELS
 from surfkit.train.views import ViewContributions
 
 

@@ -21,19 +21,19 @@ import trimesh
 from machine import save
 from PIL import Image
 
+from surfkit.apps.maps.photographs import between
+from surfkit.apps.texture.look import project
+from surfkit.apps.texture.make import local_mesh
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.maps.photographs import between
+from surfkit.io.datasets.read import read
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.simplify import simplify_to
-from surfkit.pipeline import opened
 from surfkit.raster.psnr import psnr
-from surfkit.readers.read import read
+from surfkit.runs.pipeline import opened
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame
-from surfkit.texture.look import project
-from surfkit.texture.make import local_mesh
 
 FINE = 2
 """Samples along each side of a pixel."""

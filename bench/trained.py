@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from surfkit.pipeline import with_steps
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
-from surfkit.recipe import Recipe
+from surfkit.runs.pipeline import with_steps
+from surfkit.runs.recipe import Recipe
 from surfkit.scene.photos import photo_cache
 from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer

@@ -23,14 +23,14 @@ import numpy as np
 import torch
 from machine import save
 
+from surfkit.apps.view.page import show
+from surfkit.apps.view.server import Address, served
+from surfkit.apps.view.shelf import FORMS, MOST
+from surfkit.apps.view.subject import Subject
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.export.table import SplatTable
+from surfkit.io.splats.table import SplatTable
 from surfkit.scene.scene import Frame
-from surfkit.view.page import show
-from surfkit.view.server import Address, served
-from surfkit.view.shelf import FORMS, MOST
-from surfkit.view.subject import Subject
 
 SIZE = {"width": 1280, "height": 720}
 SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]

@@ -19,7 +19,7 @@ import torch
 from machine import save
 
 from surfkit.compress.kmeans import kmeans, nearest
-from surfkit.export.ply import read_splats
+from surfkit.io.splats.ply import read_splats
 
 SIDES = ("ours", "faiss")
 

@@ -205,7 +205,7 @@ def commands() -> str:
 
     lines = ["# Commands", "", REGENERATE, "", *INTRODUCTION]
     for name in COMMANDS:
-        found = importlib.import_module(f"surfkit.cli.{name}").COMMAND
+        found = importlib.import_module(COMMANDS[name].module).COMMAND
         for second, command in (found if isinstance(found, dict) else {"": found}).items():
             lines += ["", *_command(f"{name} {second}".strip(), command)]
     return "\n".join(lines) + "\n"

@@ -14,7 +14,8 @@ import pytest
 
 from surfkit.cli.recipes import chosen_recipe
 from surfkit.core import registry
-from surfkit.core.registry import Component, choice, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component, choice
 from surfkit.core.schedule import Interval, StepCount, Steps
 
 # As in the command, and before torch is loaded: threads that wait for others do not spin.
@@ -183,12 +184,12 @@ def bare(monkeypatch):
 
 @pytest.fixture
 def world(bare, monkeypatch):
-    """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and `surfkit.recipe`."""
+    """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and its recipes."""
     importlib.import_module("surfkit.cli.parse")  # which would import the modules that are replaced below
     bare.plugins().register(Plugin(), "stand-in")
     for name, values in {
-        "surfkit.cli.train": {"COMMAND": Train},
-        "surfkit.recipe": {"Recipe": Recipe, "complete": lambda recipe, _: recipe},
+        "surfkit.apps.train": {"COMMAND": Train},
+        "surfkit.runs.recipe": {"Recipe": Recipe, "complete": lambda recipe, _: recipe},
     }.items():
         module = types.ModuleType(name)
         vars(module).update(values)
@@ -236,7 +237,7 @@ def forked_jobs():
     from forks import Forked
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("surfkit.execute.base.subprocess", types.SimpleNamespace(Popen=Forked, DEVNULL=None))
+        patch.setattr("surfkit.runs.execute.base.subprocess", types.SimpleNamespace(Popen=Forked, DEVNULL=None))
         yield
 
 

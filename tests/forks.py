@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["torch.fx.experimental.symbolic_shapes", "surfkit.pipeline", "surfkit.cli.train"])
+CONTEXT.set_forkserver_preload(["torch.fx.experimental.symbolic_shapes", "surfkit.runs.pipeline", "surfkit.apps.train"])
 
 
 def started(
@@ -81,7 +81,7 @@ class Forked:
 
 def _python(words: list[str], given: dict[str, str], log: Path) -> None:
     """`python -c CODE` or `python -m MODULE`, with what follows."""
-    from surfkit.execute.remote import DRIVER
+    from surfkit.runs.execute.remote import DRIVER
 
     os.setsid()
     _prepare(given | {DRIVER: str(os.getppid())}, log, int(given["OMP_NUM_THREADS"]))

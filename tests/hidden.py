@@ -23,7 +23,7 @@ from types import ModuleType
 
 LIBUSB = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
 """What Open3D says where that library is missing."""
-NATIVE = "surfkit.native._native"
+NATIVE = "surfkit.raster.native._native"
 RAISED = {"ImportError": ImportError, "OSError": OSError}
 
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from surfkit.core.events import Progress
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 
 
 class Watch:

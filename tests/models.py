@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from surfkit.export.ply import write_splats
-from surfkit.export.table import SplatTable
+from surfkit.io.splats.ply import write_splats
+from surfkit.io.splats.table import SplatTable
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 ORIGIN = (492000.0, 5260000.0, 430.0)

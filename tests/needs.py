@@ -5,9 +5,9 @@ from types import ModuleType
 
 import pytest
 
-from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
+from surfkit.raster import native
 
 NO_NATIVE = "surfkit was installed without its native module, as no C++ compiler or no Python headers were found"
 needs_native = pytest.mark.skipif(native.module() is None, reason=NO_NATIVE)

@@ -14,9 +14,9 @@ import hidden
 import pytest
 from hidden import NATIVE
 
-from surfkit import native
 from surfkit.cli import main
 from surfkit.core.optional import INSTALLED_AS
+from surfkit.raster import native
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 TESTS = Path(__file__).parent

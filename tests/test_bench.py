@@ -39,5 +39,11 @@ def test_imports_are_there(path):
 
 
 def test_programs_inside_are_seen():
-    source = 'RUN = """\nfrom surfkit.recipe import Recipe, Lost\n"""\n\ndef f():\n    from surfkit import Mesher\n'
-    assert set(imports(source)) == {("surfkit.recipe", "Recipe"), ("surfkit.recipe", "Lost"), ("surfkit", "Mesher")}
+    source = (
+        'RUN = """\nfrom surfkit.runs.recipe import Recipe, Lost\n"""\n\ndef f():\n    from surfkit import Mesher\n'
+    )
+    assert set(imports(source)) == {
+        ("surfkit.runs.recipe", "Recipe"),
+        ("surfkit.runs.recipe", "Lost"),
+        ("surfkit", "Mesher"),
+    }

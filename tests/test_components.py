@@ -12,7 +12,7 @@ from surfkit.core import registry
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import kind_of, offered
 from surfkit.core.schedule import rescale
-from surfkit.recipe import Recipe
+from surfkit.runs.recipe import Recipe
 from surfkit.testing import check_component
 
 OFFERED = sorted({(kind_of(cls).__name__, name): cls for _, name, cls in offered("surfkit_components")}.items())

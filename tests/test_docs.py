@@ -16,8 +16,9 @@ from surfkit.cli import COMMANDS
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import dump, write_json
-from surfkit.core.registry import HOOKS, kebab, kind_of, offered, records
-from surfkit.report.ablation import offered_tables
+from surfkit.core.hooks import HOOKS
+from surfkit.core.registry import kebab, kind_of, offered, records
+from surfkit.study.ablation import offered_tables
 
 SLOTS = {
     "mesh": "mesher",
@@ -61,7 +62,7 @@ def test_paths(page):
 @pytest.fixture
 def somewhere(tmp_path, monkeypatch):
     """A working folder with the files that commands in the pages name, on a machine that has every package."""
-    monkeypatch.setattr("surfkit.run.mesh.require_kernels", lambda what: None)
+    monkeypatch.setattr("surfkit.runs.mesh.require_kernels", lambda what: None)
     monkeypatch.chdir(tmp_path)
     for name in ("my-recipe.json", "RUN/recipe.json"):
         write_json(tmp_path / name, recipes()["2dgs"])
@@ -92,7 +93,7 @@ def parses(words, where):
     if name.startswith("-"):
         return
     assert name in COMMANDS, f"{where}: no such command"
-    command, told = importlib.import_module(f"surfkit.cli.{name}").COMMAND, f"surfkit {name}"
+    command, told = importlib.import_module(COMMANDS[name].module).COMMAND, f"surfkit {name}"
     if isinstance(command, dict):
         command, rest = (command[rest[0]], rest[1:]) if rest else (None, [])
     if not rest:

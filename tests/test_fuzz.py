@@ -66,7 +66,7 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
 
     def found(read):
         with monkeypatch.context() as patch:
-            patch.setattr("surfkit.readers.transforms.read_points", read)
+            patch.setattr("surfkit.io.datasets.transforms.read_points", read)
             return case.case([]).what
 
     def writing(path):

@@ -10,14 +10,15 @@ import pytest
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.core.registry import components, failures, find, hookimpl, plugins, records
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import components, failures, find, plugins, records
 
 CEILING = Path(__file__).parents[1] / "plugins" / "surfkit-ceiling"
 
 GOOD = """
 from dataclasses import dataclass
 from conftest_world import Loss
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 
 @dataclass(frozen=True)
 class Acme(Loss):

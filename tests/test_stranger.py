@@ -17,11 +17,11 @@ from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.registry import components
 from surfkit.densify.base import Densify, Prune
-from surfkit.export.ply import read_splats
+from surfkit.io.splats.ply import read_splats
 from surfkit.losses.base import Loss
 from surfkit.mesh.base import Mesher
 from surfkit.primitives.base import Primitive
-from surfkit.run import stage
+from surfkit.runs import stage
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint

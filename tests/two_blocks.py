@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit.blocks.schedule import Compute
 from surfkit.core.files import replacing
+from surfkit.io.datasets.data import Data
 from surfkit.partition import PictureShare, QuantileGrid
-from surfkit.pipeline import run
-from surfkit.readers.data import Data
-from surfkit.recipe import Recipe
-from surfkit.run.stage import Intervals
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe
+from surfkit.runs.stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.progress import Display
@@ -85,7 +85,7 @@ def stop_after(optimise, step):
 
     def stopping(job, state):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("surfkit.run.stage.Display", Interrupting)
+            patch.setattr("surfkit.runs.stage.Display", Interrupting)
             return optimise(job, state)
 
     return stopping

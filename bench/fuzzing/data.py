@@ -57,7 +57,7 @@ def inverse(made: Any, name: str) -> np.ndarray:
 
 def arrays(here: Path) -> None:
     """Depth priors of surfkit and CityGaussianV2."""
-    from surfkit.readers.depth_files import write_map, write_record
+    from surfkit.io.datasets.depth_files import write_map, write_record
 
     made = colmap(here)
     for view in made.scene.train:
@@ -102,7 +102,7 @@ def parts(made: Any) -> dict[str, Any]:
 
 def sparse(made: Any, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Write the sparse points, in the input frame; positions and colours."""
-    from surfkit.export.ply import write_points
+    from surfkit.io.splats.ply import write_points
 
     xyz, rgb = made.scene.frame.to_input(made.scene.cloud.xyz.numpy()), made.scene.cloud.rgb.numpy()
     write_points(path, xyz, rgb)

@@ -31,7 +31,7 @@ SIZES = (0, 1, 2, 3, 15, 255, 256, 2**14 - 1)
 def write_model(folder: Path, name: str) -> Path:
     """A file of 600 splats."""
     from surfkit.core.registry import find
-    from surfkit.export.base import Format
+    from surfkit.io.splats.base import Format
     from surfkit.testing.files import splat_table
 
     form = find(Format, name.removesuffix("-4").removesuffix("-spz"))(**FORMATS[name])

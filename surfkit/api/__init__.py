@@ -8,18 +8,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from surfkit import pipeline
 from surfkit.api.dataset import Dataset, read
 from surfkit.api.listen import OnStep, listening
 from surfkit.api.results import Figures, Mesh
 from surfkit.api.run import TrainedRun, open_run
-from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import say
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
-from surfkit.recipe import Recipe, complete
+from surfkit.runs import pipeline
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.recipe import Recipe, complete
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 

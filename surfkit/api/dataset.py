@@ -13,8 +13,8 @@ import torch
 from surfkit.api.listen import heard
 from surfkit.core.check import BadInput
 from surfkit.core.registry import unknown
-from surfkit.readers.data import Data, Reading
-from surfkit.readers.read import read as read_scene
+from surfkit.io.datasets.data import Data, Reading
+from surfkit.io.datasets.read import read as read_scene
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, Scene, View
 
@@ -95,7 +95,7 @@ def read(path: str | Path, **options: Any) -> Dataset:
     Args:
         path: Folder of the data set.
         options: As on the command line, with underscores: `scale=4`, `longest=1600`, `test_every=8`, `masks=...`; see
-            `surfkit.readers.data.Reading`.
+            `surfkit.io.datasets.data.Reading`.
 
     Raises:
         BadInput: Something is missing, damaged or not supported.

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from surfkit import pipeline
 from surfkit.api.dataset import Dataset
 from surfkit.api.results import Figures, Mesh
 from surfkit.core.check import BadInput
@@ -20,23 +19,24 @@ from surfkit.core.registry import components, find, unknown
 from surfkit.core.tree import evolve
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
-from surfkit.export.base import Format
-from surfkit.export.table import SplatTable
+from surfkit.io.splats.base import Format
+from surfkit.io.splats.table import SplatTable
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
-from surfkit.method.base import Reconstruction
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
-from surfkit.recipe import Recipe
-from surfkit.run.context import RunContext
-from surfkit.run.folder import note_metrics
-from surfkit.run.journal import record_events
-from surfkit.run.lod import load_levels
-from surfkit.run.measure import evaluate
-from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
-from surfkit.run.method import refuse_mesher, refuse_not_drawn, splats_of
-from surfkit.run.notes import collect_notes
-from surfkit.run.prepare import with_maps_to_mesh
+from surfkit.runs import pipeline
+from surfkit.runs.context import RunContext
+from surfkit.runs.folder import note_metrics
+from surfkit.runs.journal import record_events
+from surfkit.runs.lod import load_levels
+from surfkit.runs.measure import evaluate
+from surfkit.runs.mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.method import refuse_mesher, refuse_not_drawn, splats_of
+from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.notes import collect_notes
+from surfkit.runs.prepare import with_maps_to_mesh
+from surfkit.runs.recipe import Recipe
 from surfkit.scene.camera import Camera
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import View

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 
 from surfkit.appearance.exposure import Exposure
-from surfkit.core.registry import Component, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 
 
 @hookimpl

@@ -1,10 +1,9 @@
 """The `surfkit` command: finds the subcommand, runs it, and prints an error that a user can correct as one line.
 
-Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
-and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
-word. The module is imported by its name, which may be a keyword of Python, and only when its command is asked for.
-So `surfkit --help` loads neither torch nor tyro. Packages add commands by the hook `surfkit_commands`; they are loaded
-for a word that is none of ours.
+Commands come from the hook `surfkit_commands`: those of surfkit from `surfkit/apps`, others from packages, which are
+loaded for a word that is none of ours. The module of a command has a dataclass named `COMMAND`: its docstring and its
+fields are the help, and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several
+of these, by a second word. Only the command that is given is imported: `surfkit --help` loads neither torch nor tyro.
 """
 
 from __future__ import annotations
@@ -29,35 +28,12 @@ from surfkit.cli.streams import (
 )
 from surfkit.core.check import BadInput, Fault, printable
 from surfkit.core.files import DISK_FULL
+from surfkit.core.hooks import LazyCommand
 from surfkit.core.memory import is_out_of_memory, out_of_memory
 from surfkit.core.signals import terminable
 
-COMMANDS = {
-    "train": "Train a model, and make its mesh, from photographs with known cameras.",
-    "tune": "Train one block of a large scene, in its own process or on another machine.",
-    "mesh": "Make the mesh of a finished run, or make it again with other settings.",
-    "maps": "Draw maps of a finished run: surface model, orthophoto, contour lines, point cloud, differences.",
-    "texture": "Give the mesh of a finished run a texture from the photographs, as OBJ, GLB and 3D Tiles.",
-    "compress": "Compress the model of a finished run, or a file of splats.",
-    "lod": "Make levels of detail of a finished run, or make them again with other settings.",
-    "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
-    "render": "Draw a finished run along a path of the camera, as a video or as pictures.",
-    "view": "Look at a finished run, or a file of splats, a mesh or points, in a browser.",
-    "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
-    "status": "Show the progress of a run.",
-    "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
-    "report": "Write a report of runs or of an ablation table as one HTML file.",
-    "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
-    "export": "Write the splats of a run or of a file in another format, for other programs.",
-    "prepare": "Find cameras, points or depth: `prepare photos`, `prepare points`, `prepare depth`.",
-    "ablate": "Train every row of an ablation table, and compare the rows.",
-    "tables": "List the ablation tables that `surfkit ablate` accepts, or the rows of one.",
-    "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
-    "components": "List the components that recipes are made of, by kind.",
-    "plugins": "List the plugins: package, components, and the error if one does not load.",
-    "new": "Write the files of a new plugin, with a working part and its tests: `new plugin`.",
-}
-"""What there is to run, with the line that `surfkit --help` shows."""
+COMMANDS: dict[str, LazyCommand] = importlib.import_module("surfkit.apps").surfkit_commands()
+"""Those of surfkit. The folder stands above this one, and so is not imported by name."""
 BEGIN = (
     "To begin, `surfkit prepare photos FOLDER` makes a data set of photographs or a video, and `surfkit doctor DATA` "
     "checks one that is there."
@@ -65,21 +41,6 @@ BEGIN = (
 """What `surfkit --help` says to those who are new."""
 MORE = "`surfkit help COMMAND` tells more. `surfkit plugins` lists the commands that packages add."
 """What it ends with."""
-RESUMED = ("train", "tune", "prepare", "ablate", "maps", "texture", "render")
-"""Commands that go on with what an interrupted one has done."""
-MEMORY_ADVICE = {
-    "train": "smaller photographs (--longest, --scale) or fewer points need less",
-    "import": "smaller photographs (--longest, --scale) or mesh:none need less",
-    "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
-    "maps": "a smaller --tile needs less",
-    "texture": "a lower --memory, a larger --texel or a smaller --size need less",
-    "lod": "a lower --memory or --lod.steps 0 need less",
-    "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
-    "render": "a smaller --size needs less",
-    "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
-    "prepare": "a lower --longest or --estimator.longest needs less",
-}
-"""What a user can lower when a command runs out of memory."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -120,8 +81,8 @@ def overview() -> str:
     """The text of `surfkit --help`."""
     column, width = max(map(len, COMMANDS)) + 4, max(60, shutil.get_terminal_size().columns)
     lines = [
-        textwrap.fill(text, width, initial_indent=f"  {name}".ljust(column), subsequent_indent=" " * column)
-        for name, text in COMMANDS.items()
+        textwrap.fill(command.summary, width, initial_indent=f"  {name}".ljust(column), subsequent_indent=" " * column)
+        for name, command in COMMANDS.items()
     ]
     return "\n".join(
         [
@@ -139,7 +100,7 @@ def overview() -> str:
     )
 
 
-def added_commands() -> dict[str, type]:
+def added_commands() -> dict[str, type | LazyCommand]:
     """The commands of packages, by the word that users type.
 
     Raises:
@@ -148,12 +109,13 @@ def added_commands() -> dict[str, type]:
     from surfkit.core.registry import offered_once
 
     found = offered_once("surfkit_commands", "a command")
-    if taken := sorted(found.keys() & COMMANDS.keys()):
-        raise BadInput(
-            f"a package offers a command named {taken[0]!r}, which surfkit has (`surfkit plugins` lists them); "
-            "uninstall it, or leave it out with SURFKIT_PLUGINS=none"
-        )
-    return found
+    return {name: command for name, command in found.items() if name not in COMMANDS}
+
+
+def _given(words: list[str]) -> LazyCommand:
+    """The command that the words give; one without advice if it is not known or not a lazy one."""
+    found = COMMANDS.get(words[0]) or added_commands().get(words[0]) if words else None
+    return found if isinstance(found, LazyCommand) else LazyCommand("", "")
 
 
 def _helped(words: list[str]) -> int:
@@ -181,7 +143,7 @@ def _guarded(words: list[str]) -> int:
     try:
         return _dispatch(words)
     except KeyboardInterrupt:
-        goes_on = "; the same command goes on" if words and words[0] in RESUMED else ""
+        goes_on = "; the same command goes on" if _given(words).goes_on else ""
         print(f"surfkit: interrupted{goes_on}", file=sys.stderr)
         return 130
     except SystemExit as stop:  # --help, and rich when nobody reads its output any more
@@ -206,7 +168,7 @@ def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:
     if is_out_of_memory(error):
         text = f"{' '.join(words[:1])}: {out_of_memory(error)}"
         _release(error)
-        return f"{text}; {MEMORY_ADVICE.get(words[0], 'more memory is needed')}", 1
+        return f"{text}; {_given(words).memory_advice}", 1
     if isinstance(error, (FileExistsError, NotADirectoryError)) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: a file is in the place of a folder; name another", 2
     if isinstance(error, OSError) and error.filename is not None and error.errno not in DISK_FULL:  # no permission
@@ -238,14 +200,18 @@ def _dispatch(words: list[str]) -> int:
         known = [*COMMANDS, *(added := added_commands())]
         if name not in added:
             raise BadInput(f"no command {name!r}; {_meant(name, known)}commands: {', '.join(known)}")
-        return parse(added[name], rest, f"surfkit {name}").run() or 0
-    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
+        command = added[name]
+    else:
+        command = COMMANDS[name]
+    if isinstance(command, LazyCommand):
+        command = importlib.import_module(command.module).COMMAND
     if isinstance(command, dict):
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
             if rest and rest[0] not in (*HELP, "help"):
                 raise BadInput(f"{name} has no {rest[0]!r}; {_meant(rest[0], command)}usage: {wanted}")
-            print(f"{COMMANDS[name]}\n\nusage: {wanted}\n\n`surfkit {name} {next(iter(command))} --help` tells more.")
+            first = f"`surfkit {name} {next(iter(command))} --help` tells more."
+            print(f"{_given(words).summary}\n\nusage: {wanted}\n\n{first}")
             return 0
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
     return parse(command, rest, f"surfkit {name}").run() or 0

@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union
 
@@ -21,7 +20,6 @@ import tyro
 
 from surfkit.cli.help_cache import HELP
 from surfkit.cli.parts import with_parts
-from surfkit.cli.table import print_failures, print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.registry import offered_once
@@ -44,7 +42,7 @@ def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
 
 def _complete(recipe: Any, argv: Sequence[str]) -> Any:
     """The recipe with a flag for each learning rate of the primitive that `argv` chooses."""
-    from surfkit.recipe import complete
+    from surfkit.runs.recipe import complete
 
     return complete(recipe, next((w.removeprefix("primitive:") for w in argv if w.startswith("primitive:")), None))
 
@@ -73,25 +71,12 @@ chosen_recipe = tyro.conf.arg(constructor_factory=lambda: recipe_choice(ARGV.get
 """Marks the field of a command that takes a recipe."""
 
 
-@dataclass(frozen=True)
-class Recipes:
-    """List the recipes that `surfkit train recipe:NAME` accepts."""
-
-    def run(self) -> None:
-        """Print one line per recipe."""
-        print_table(("recipe", "what it is"), [(name, about(recipe)) for name, recipe in recipes().items()])
-        print_failures()
-
-
-COMMAND = Recipes
-
-
 def part_of_run(field: str, otherwise: Callable[[], Any]) -> Any:
     """The part at a field of the recipe of the run that the command line names; `otherwise()` if there is none."""
     for word in ARGV.get():
         path = Path(word) / "recipe.json"
         if not word.startswith("-") and path.is_file():
-            from surfkit.recipe import Recipe
+            from surfkit.runs.recipe import Recipe
 
             return getattr(read_json(path, Recipe), field) or otherwise()
     return otherwise()
@@ -103,7 +88,7 @@ def settled(recipe: Any) -> Any:
     Raises:
         BadInput: Another word, or the recipe itself, sets something that the method does not use.
     """
-    from surfkit.recipe import refuse_unused, unused, without_unused
+    from surfkit.runs.recipe import refuse_unused, unused, without_unused
 
     words, names = ARGV.get(), [name.replace("_", "-") for name in recipe.unused]
     for word in words:
@@ -132,6 +117,6 @@ def _files(argv: Sequence[str]) -> list[str]:
 
 
 def _read(file: str) -> Any:
-    from surfkit.recipe import Recipe
+    from surfkit.runs.recipe import Recipe
 
     return read_json(Path(file), Recipe)

@@ -1,6 +1,6 @@
 """Trained models in fewer bytes."""
 
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 
 
 @hookimpl

@@ -19,7 +19,7 @@ from torch import Tensor
 from surfkit.compress.cuda import codes as gpu
 from surfkit.compress.nearest import CPU, Features, Search, checked, itself, nearest, searching
 from surfkit.core.check import BadInput, expect
-from surfkit.native import module
+from surfkit.raster.native import module
 
 __all__ = ["kmeans", "nearest"]
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.core.check import BadInput, expect
-from surfkit.native import module
+from surfkit.raster.native import module
 
 CPU = torch.device("cpu")
 MOST = 1e15

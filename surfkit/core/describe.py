@@ -10,7 +10,10 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from surfkit.core.hints import hints_of
-from surfkit.core.registry import Component, name_of
+from surfkit.core.registry import Component, components, kebab, kind_of, name_of, offered
+
+Kinds = dict[str, dict[str, type[Component]]]
+"""Components by kind and name."""
 
 
 @dataclass(frozen=True)
@@ -98,3 +101,13 @@ def _shown(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key}: {_shown(item)}" for key, item in value.items()) or "none"
     return "none" if value is None else str(value)
+
+
+def by_kind() -> Kinds:
+    """Every offered component, by kind and name."""
+    bases = {kind_of(cls) for _, _, cls in offered("surfkit_components")}
+    return {kebab(base.__name__): _of_kind(base) for base in sorted(bases, key=lambda base: base.__name__)}
+
+
+def _of_kind(base: type[Component]) -> dict[str, type[Component]]:
+    return {name: cls for name, cls in components(base).items() if kind_of(cls) is base}

@@ -23,15 +23,15 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.hints import hints_of
+from surfkit.core.hooks import HOOKS, Hooks, LazyCommand
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
-_PARTS = """
-export readers raster sfm primitives losses depth start appearance densify mesh partition compress execute refine lod
-method recipes
+_FOLDERS = """
+io.splats io.datasets raster apps.sfm primitives losses depth start appearance densify mesh partition compress
+runs.execute train.refine compress.levels runs.methods study.recipes apps
 """
-BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS.split())
-hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
+BUILTIN = tuple(f"surfkit.{name}" for name in _FOLDERS.split())
 
 
 class Component(ABC):  # noqa: B024 (the methods are those of each kind)
@@ -41,39 +41,6 @@ class Component(ABC):  # noqa: B024 (the methods are those of each kind)
 C = TypeVar("C", bound=Component)
 
 
-class Hooks:
-    """What a plugin may implement; each function is marked with `hookimpl`."""
-
-    @hookspec
-    def surfkit_components(self) -> Mapping[str, type[Component]]:
-        """Return the components this package offers, by the name users type."""
-
-    @hookspec
-    def surfkit_recipes(self) -> Mapping[str, Any]:
-        """Return the recipes this package offers, by the name users type."""
-
-    @hookspec
-    def surfkit_tables(self) -> Mapping[str, Any]:
-        """Return the ablation tables this package offers, by the name users type."""
-
-    @hookspec
-    def surfkit_rows(self) -> Mapping[str, Any]:
-        """Return rows that this package adds to tables that are there, a sequence by the name of the table."""
-
-    @hookspec
-    def surfkit_commands(self) -> Mapping[str, type]:
-        """Return the commands this package adds to `surfkit`, by the word that users type.
-
-        Each is a dataclass: its docstring and its fields are the help, and `run()` does the work and returns an exit
-        status, or None for 0.
-        """
-
-    @hookspec
-    def surfkit_event(self, event: Any) -> None:
-        """See one event of a run: a stage began, a step ended, a file was written."""
-
-
-HOOKS = tuple(name for name in vars(Hooks) if name.startswith("surfkit_"))
 KINDS = {
     "surfkit_recipes": "a surfkit.Recipe",
     "surfkit_tables": "a surfkit.Table",
@@ -318,9 +285,11 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
         wrong = [item for item in items if not is_dataclass(item) or isinstance(item, type)]
         if wrong or (hook == "surfkit_rows" and items == [value]):
             raise BadInput(f"{name!r} is {repr(value)[:80]}, and not {KINDS[hook]}")
-    if hook == "surfkit_commands":
+    if hook == "surfkit_commands" and not isinstance(value, LazyCommand):
         if not (isinstance(value, type) and is_dataclass(value) and callable(getattr(value, "run", None))):
-            raise BadInput(f"{name!r} is {repr(value)[:80]}, and not a dataclass with a method run()")
+            raise BadInput(
+                f"{name!r} is {repr(value)[:80]}, and neither a dataclass with a method run() nor a surfkit.LazyCommand"
+            )
         if not (value.__doc__ or "").strip() or (value.__doc__ or "").startswith(f"{value.__name__}("):
             raise BadInput(f"{_where(value)} has no docstring; its first line is what `surfkit --help` shows")
     if hook != "surfkit_components":

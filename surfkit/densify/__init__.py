@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from surfkit.core.registry import Component, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap, Elongation
 from surfkit.densify.limited import Limited

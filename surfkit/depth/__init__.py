@@ -1,6 +1,6 @@
 """Depth estimators, by registered name."""
 
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 from surfkit.depth.depth_anything import DepthAnythingV2
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep

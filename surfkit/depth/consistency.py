@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from surfkit.depth.matching import ray_map, way_numbers
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 

@@ -20,9 +20,9 @@ from surfkit.core.files import DISK_FULL, sweep
 from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare import Preparation, fault_of, without_damaged
-from surfkit.readers.depth_files import FOLDER, RECORD, is_whole, map_path, read_record, write_record
-from surfkit.readers.fingerprint import Fingerprint, digest
-from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
+from surfkit.io.datasets.depth_files import FOLDER, RECORD, is_whole, map_path, read_record, write_record
+from surfkit.io.datasets.fingerprint import Fingerprint, digest
+from surfkit.io.datasets.made_maps import Made, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
 from surfkit.scene.pixels import PLAIN
 from surfkit.scene.scene import Scene

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.native import lacking, module
+from surfkit.raster.native import lacking, module
 from surfkit.scene.camera import Camera
 
 ENOUGH = 2000

@@ -19,7 +19,7 @@ from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
 from surfkit.depth.scanlines import best_planes, smooth_costs
-from surfkit.readers.depth_files import save_array
+from surfkit.io.datasets.depth_files import save_array
 from surfkit.scene.camera import Camera
 from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo

@@ -20,8 +20,8 @@ from surfkit.core.files import replacing
 from surfkit.core.registry import name_of
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.readers.data import Data
-from surfkit.readers.depth_files import (
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_files import (
     FOLDER,
     DepthFile,
     confidence_path,
@@ -31,10 +31,10 @@ from surfkit.readers.depth_files import (
     write_map,
     write_record,
 )
-from surfkit.readers.depth_prior import TRUSTED
-from surfkit.readers.fingerprint import content_of, digest
-from surfkit.readers.panoramas import points_remedy
-from surfkit.readers.read import observations
+from surfkit.io.datasets.depth_prior import TRUSTED
+from surfkit.io.datasets.fingerprint import content_of, digest
+from surfkit.io.datasets.panoramas import points_remedy
+from surfkit.io.datasets.read import observations
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View

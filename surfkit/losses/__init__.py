@@ -1,6 +1,6 @@
 """Loss terms, by the name users type."""
 
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior

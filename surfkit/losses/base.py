@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.raster.api import Maps, Splats
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps, log_linear
+from surfkit.io.datasets.depth_prior import KNOWN
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
-from surfkit.readers.depth_prior import KNOWN
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from surfkit.core.registry import Component, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.stereo import Stereo

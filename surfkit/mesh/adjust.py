@@ -9,7 +9,7 @@ import torch
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.sights import Sights, boxes_of, for_all
-from surfkit.native import module
+from surfkit.raster.native import module
 
 ROUNDS = 2
 """How often vertices are looked for in the views."""

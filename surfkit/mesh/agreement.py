@@ -11,11 +11,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.depth.matching import ray_map, way_numbers
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.trust import Trust
-from surfkit.native import module
 from surfkit.raster.api import Maps
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 CONFIDENT = 0.375

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.raster.api import Maps, Rasterizer, Splats
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
 
 MOST_LEVELS = 50

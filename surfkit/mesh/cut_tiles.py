@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from surfkit.native import module
+from surfkit.raster.native import module
 
 UNKNOWN = -1
 LAST = np.iinfo(np.int32).max

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.native import module
+from surfkit.raster.native import module
 
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Vertices of the edges of a tetrahedron."""

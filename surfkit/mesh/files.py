@@ -14,7 +14,7 @@ import numpy as np
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.export.glb import FLOAT, INDICES, INT, SHORT, VERTICES, Blocks, linear_colors, write_glb
+from surfkit.io.glb import FLOAT, INDICES, INT, SHORT, VERTICES, Blocks, linear_colors, write_glb
 from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.scene.scene import Frame
 

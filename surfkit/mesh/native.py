@@ -9,7 +9,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.mesh.cubes import EDGES, triangles
 from surfkit.mesh.lattice import MOST, REACH, Corner, HostGrid, Lattice, Picture, Pieces
 from surfkit.mesh.reference import ReferenceGrid
-from surfkit.native import lacking, module
+from surfkit.raster.native import lacking, module
 
 
 class NativeGrid(HostGrid):

@@ -10,8 +10,8 @@ from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.io.datasets.depth_prior import DepthPrior, resized
 from surfkit.mesh.base import MeshInput
-from surfkit.readers.depth_prior import DepthPrior, resized
 from surfkit.scene.camera import Camera
 
 LONGEST = 4096

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from surfkit.mesh.lattice import FULL, Picture, least_slant
-from surfkit.native import module
 from surfkit.raster.api import Maps
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 F = np.float32

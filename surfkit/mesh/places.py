@@ -7,7 +7,7 @@ import torch
 
 from surfkit.mesh.delaunay import Tetrahedra
 from surfkit.mesh.points import Points
-from surfkit.native import module
+from surfkit.raster.native import module
 
 SHELL = (-0.5, 0.5, 1.0, 1.5, 2.0)
 """Places before and behind a point along its normal that are looked at, cells: tetrahedra behind a surface are large,

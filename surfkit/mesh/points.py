@@ -10,7 +10,7 @@ import numpy as np
 
 from surfkit.mesh.delaunay import split
 from surfkit.mesh.sights import Sight, Sights, for_all
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.scene.morton import morton_order
 
 LEVELS = 2

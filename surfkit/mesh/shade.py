@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.mesh.base import Mesh
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 BACKGROUND = 1.0

@@ -20,7 +20,7 @@ from surfkit.mesh.fusion import TILES
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import Which, depth_of
 from surfkit.mesh.trust import Trust
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 PIXEL_BYTES = 18

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
-from surfkit.native import lacking, module
+from surfkit.raster.native import lacking, module
 
 SPARE = 6.0
 """What a collapse may cost, in squares of the length that is allowed: then 99 of 100 places stay within it."""

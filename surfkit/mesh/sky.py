@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.events import Warned, emit
+from surfkit.io.datasets.depth_prior import KNOWN
 from surfkit.mesh.base import MeshInput
-from surfkit.readers.depth_prior import KNOWN
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.scene.up_direction import up_of_views

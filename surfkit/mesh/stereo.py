@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
 
 POINTS = 2_000_000

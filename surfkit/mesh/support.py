@@ -7,7 +7,7 @@ import torch
 
 from surfkit.mesh.adjust import beside
 from surfkit.mesh.sights import Sights, boxes_of, for_all
-from surfkit.native import module
+from surfkit.raster.native import module
 
 
 def supported(

@@ -7,9 +7,9 @@ from abc import abstractmethod
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.overlap import Depths
 from surfkit.raster.api import Maps
-from surfkit.readers.depth_prior import DepthPrior
 
 
 class Trust(Component):

@@ -35,7 +35,7 @@ from surfkit.mesh.sights import Seeing, Sights, boxes_of, for_all, seen
 from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.support import supported
 from surfkit.mesh.trust import Trust
-from surfkit.native import lacking, module
+from surfkit.raster.native import lacking, module
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import up_of_views

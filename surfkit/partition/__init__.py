@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from surfkit.core.registry import Component, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
 from surfkit.partition.balanced import Balanced

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from surfkit.core.registry import Component, hookimpl
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D

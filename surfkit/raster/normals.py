@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from surfkit import native
+from surfkit.raster import native
 from surfkit.scene.camera import Camera
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from surfkit import native
 from surfkit.core.check import BadInput
+from surfkit.raster import native
 from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from surfkit import native
+from surfkit.raster import native
 from surfkit.raster.cuda import ssim as gpu
 
 C1, C2 = 0.01**2, 0.03**2

@@ -1,6 +1,6 @@
 """Initial points of the optimisation, by registered name."""
 
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.splats import SplatStart
 from surfkit.start.stereo import StereoStart

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.export.axes import Axes, AxesOrAuto, in_words
-from surfkit.export.files import assumed_axes, from_axes, untold_axes
-from surfkit.export.models import in_scene, read_sound
-from surfkit.export.table import SplatTable
+from surfkit.io.splats.axes import Axes, AxesOrAuto, in_words
+from surfkit.io.splats.files import assumed_axes, from_axes, untold_axes
+from surfkit.io.splats.models import in_scene, read_sound
+from surfkit.io.splats.table import SplatTable
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.psnr import psnr

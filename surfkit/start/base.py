@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
 
 

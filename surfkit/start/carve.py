@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 MOST_VOXELS = 1 << 27

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.vectors import unit
 from surfkit.start.voxels import Samples

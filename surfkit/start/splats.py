@@ -10,9 +10,9 @@ import torch
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
-from surfkit.export.axes import AxesOrAuto
-from surfkit.export.models import existing_model, model_file, read_sound, warn_of_no_fit
-from surfkit.export.table import THIN, SplatTable
+from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.models import existing_model, model_file, read_sound, warn_of_no_fit
+from surfkit.io.splats.table import THIN, SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
 from surfkit.scene.scene import Cloud, Scene

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.init import gaps
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.scene.vectors import unit
 from surfkit.start.base import Start, StartInput

@@ -9,12 +9,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.readers.capture import Capture
-from surfkit.readers.data import Data
-from surfkit.readers.depth_files import DepthFile
-from surfkit.readers.depth_layout import DepthLayout, DepthQuery
-from surfkit.readers.read import read_capture, reader_of
-from surfkit.readers.split import Split
+from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_files import DepthFile
+from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
+from surfkit.io.datasets.read import read_capture, reader_of
+from surfkit.io.datasets.split import Split
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 

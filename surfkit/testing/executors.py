@@ -6,7 +6,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from surfkit.execute.base import Executor, Job
+from surfkit.runs.execute.base import Executor, Job
 
 QUIET_S = 0.5
 """For so long nothing may be heard of a job that was stopped."""

@@ -9,7 +9,16 @@ from typing import Any
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from surfkit.sfm.exif import ALTITUDE, ALTITUDE_REF, EXIF_IFD, GPS_IFD, LATITUDE, LATITUDE_REF, LONGITUDE, LONGITUDE_REF
+from surfkit.apps.sfm.exif import (
+    ALTITUDE,
+    ALTITUDE_REF,
+    EXIF_IFD,
+    GPS_IFD,
+    LATITUDE,
+    LATITUDE_REF,
+    LONGITUDE,
+    LONGITUDE_REF,
+)
 
 FINEST = 10**7
 """Parts of a second of arc and of a metre."""

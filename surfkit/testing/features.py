@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from surfkit.sfm.base import FeatureExtractor, FeatureMatcher, Features, MatchInput
-from surfkit.sfm.engine import load_engine
-from surfkit.sfm.matching import write_features
+from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, MatchInput
+from surfkit.apps.sfm.engine import load_engine
+from surfkit.apps.sfm.matching import write_features
 from surfkit.testing.compare import assert_same, unchanged
 
 CPU = torch.device("cpu")

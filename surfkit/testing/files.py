@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.export.base import HEAD, Format
-from surfkit.export.table import SplatTable, Tile
+from surfkit.io.splats.base import HEAD, Format
+from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 from surfkit.testing.compare import refuses, unchanged
 

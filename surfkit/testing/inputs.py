@@ -12,9 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from surfkit.compress.levels.base import LodInput
 from surfkit.densify.base import Contribution, Step
 from surfkit.depth.base import DepthInput
-from surfkit.lod.base import LodInput
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_prior import DepthPrior
+from surfkit.io.datasets.read import observations, read
 from surfkit.losses.base import Neighbour, Target
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.overlap import Depths
@@ -25,9 +28,6 @@ from surfkit.primitives.points import Points
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import DepthPrior
-from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.scene import Cloud, Frame, View

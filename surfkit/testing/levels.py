@@ -9,9 +9,9 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from surfkit.lod.base import LevelsOfDetail, LodInput
-from surfkit.lod.sound import fault
-from surfkit.lod.tree import LodTree
+from surfkit.compress.levels.base import LevelsOfDetail, LodInput
+from surfkit.compress.levels.sound import fault
+from surfkit.compress.levels.tree import LodTree
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import lod_input
 

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, StepDone
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 from surfkit.core.schedule import rescale
 from surfkit.testing.parts import check_component
 
 if TYPE_CHECKING:
-    from surfkit.method.base import Method, Reconstruction
-    from surfkit.readers.data import Data
+    from surfkit.io.datasets.data import Data
+    from surfkit.runs.methods.base import Method, Reconstruction
     from surfkit.scene.scene import View
 
 
@@ -36,7 +37,7 @@ def check_method(method: Method, data: Data | None = None, folder: Path | None =
         with tempfile.TemporaryDirectory() as temporary:
             check_method(method, data or _small_data(Path(temporary, "data")), folder or Path(temporary, "runs"))
         return
-    from surfkit.recipe import Recipe
+    from surfkit.runs.recipe import Recipe
 
     name, known = type(method).__name__, [field.name for field in fields(Recipe)]
     check_component(method)
@@ -61,7 +62,7 @@ def check_method(method: Method, data: Data | None = None, folder: Path | None =
 
 
 def _small_data(folder: Path) -> Data:
-    from surfkit.readers.data import Data
+    from surfkit.io.datasets.data import Data
     from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
     folder.mkdir(parents=True)
@@ -97,13 +98,13 @@ def _interrupting(at: int | None) -> Iterator[_Listener]:
 
 def _made(method: Method, data: Data, folder: Path) -> Reconstruction:
     """What the method makes, going on from what is in the folder."""
+    from surfkit.io.datasets.read import read
     from surfkit.raster.select import select
-    from surfkit.readers.read import read
-    from surfkit.recipe import Recipe
-    from surfkit.run.context import RunContext
-    from surfkit.run.folder import Run
-    from surfkit.run.method import method_input, with_drawing
-    from surfkit.run.stage import Intervals
+    from surfkit.runs.context import RunContext
+    from surfkit.runs.folder import Run
+    from surfkit.runs.method import method_input, with_drawing
+    from surfkit.runs.recipe import Recipe
+    from surfkit.runs.stage import Intervals
     from surfkit.train.data_cache import CacheSettings
 
     run = Run(folder, Recipe(method=method), data)
@@ -115,7 +116,7 @@ def _made(method: Method, data: Data, folder: Path) -> Reconstruction:
 
 
 def _first_view(data: Data) -> View:
-    from surfkit.readers.read import read
+    from surfkit.io.datasets.read import read
 
     return read(data).train[0]
 
@@ -123,7 +124,7 @@ def _first_view(data: Data) -> View:
 def _check_sound(name: str, made: Reconstruction, data: Data) -> None:
     import torch
 
-    from surfkit.run.method import refuse_unsound
+    from surfkit.runs.method import refuse_unsound
 
     assert made.mesh or made.splats or made.draw, f"{name} returned no mesh, no splats and nothing that draws"
     json.dumps(dump(dict(made.facts)), allow_nan=False)

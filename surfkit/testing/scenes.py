@@ -14,6 +14,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from surfkit.io.datasets.base import Reader
+from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.undistort import is_panorama
 from surfkit.partition.assign import Assign
 from surfkit.partition.base import Cells, CoarseModel, Ground, Partition
 from surfkit.primitives.base import Primitive
@@ -21,16 +25,12 @@ from surfkit.primitives.columns import RATES
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.readers.base import Reader
-from surfkit.readers.capture import Capture
-from surfkit.readers.data import Data
-from surfkit.readers.undistort import is_panorama
-from surfkit.refine.base import Refine
 from surfkit.scene.scene import Cloud, View
 from surfkit.start.base import Start, StartInput
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import cloud, coarse_model, mesh_input, start_input, survey
 from surfkit.testing.synthetic import Synthetic
+from surfkit.train.refine.base import Refine
 
 ABOUT = 10.0
 """The number of points that a start expects is right within this factor."""

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from surfkit.cuda import modules
-from surfkit.cuda.emulated import Emulated
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.nvrtc import modules
+from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)

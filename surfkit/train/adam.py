@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surfkit import native
-from surfkit.cuda.modules import Kernels, kernels
-from surfkit.cuda.source import Source
 from surfkit.primitives.points import Columns, Points
+from surfkit.raster import native
+from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.raster.nvrtc.source import Source
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 SOURCE = Source(Path(__file__).parent / "cuda" / "adam.cu")

@@ -13,7 +13,8 @@ from rich.progress import Progress as Live
 
 from surfkit.core.check import printable
 from surfkit.core.events import Progress
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 from surfkit.train.progress import PLAIN_EVERY_S, larger
 
 

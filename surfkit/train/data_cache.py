@@ -9,11 +9,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
-from surfkit.cuda.memory import free_gpu_bytes
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_prior import Alignment, Priors, prior_bytes, read_priors
+from surfkit.io.datasets.masks import mask_cache, mask_sizes
 from surfkit.losses.base import Loss
-from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import Alignment, Priors, prior_bytes, read_priors
-from surfkit.readers.masks import mask_cache, mask_sizes
+from surfkit.raster.nvrtc.memory import free_gpu_bytes
 from surfkit.scene.align import SCALE_BAND
 from surfkit.scene.cache import Cache, share
 from surfkit.scene.copies import Copies

@@ -9,10 +9,10 @@ from functools import cached_property
 from torch import Tensor
 
 from surfkit.core.schedule import LearningRate
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.raster.api import Rasterizer
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.train.neighbour_selector import NeighbourSelector
 from surfkit.train.stage import Stage, rates_of

@@ -11,11 +11,11 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import name_of
-from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.losses.base import Target
 from surfkit.primitives.edit import OBSERVED_EVERY, observe
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps
+from surfkit.raster.nvrtc.memory import peak_gpu_bytes
 from surfkit.train.image_appearance import fresh_appearances
 from surfkit.train.next_view import foretell
 from surfkit.train.retry_on_oom import retry_on_oom

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.cache import out_of_turn
 from surfkit.train.views import Order
 

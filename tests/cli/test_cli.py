@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.cli import COMMANDS, MEMORY_ADVICE, main
+from surfkit.cli import COMMANDS, main
 from surfkit.cli.parse import parse
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 
 OK = ("train", "recipe:discs", "--data", "d")
 
@@ -34,15 +34,15 @@ def command(monkeypatch, run):
         def run(self):
             return run()
 
-    module = types.ModuleType("surfkit.cli.export")
+    module = types.ModuleType("surfkit.apps.export")
     module.COMMAND = Export
-    monkeypatch.setitem(sys.modules, "surfkit.cli.export", module)
+    monkeypatch.setitem(sys.modules, "surfkit.apps.export", module)
 
 
 def test_help_lists_every_command(capsys):
     assert main(["--help"]) == main([]) == 0
     out = " ".join(capsys.readouterr().out.split())  # texts are wrapped
-    assert all(f" {name} {text}" in out for name, text in COMMANDS.items())
+    assert all(f" {name} {command.summary}" in out for name, command in COMMANDS.items())
 
 
 def test_version(capsys):
@@ -225,7 +225,7 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
     assert (main(["export"]), capsys.readouterr().err) == (2, "surfkit: data: no images\n")
     command(monkeypatch, interrupted)
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
-    monkeypatch.setattr("surfkit.cli.RESUMED", ("export",))
+    monkeypatch.setitem(COMMANDS, "export", replace(COMMANDS["export"], goes_on=True))
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted; the same command goes on\n")
     command(monkeypatch, lambda: 3)
     assert main(["export"]) == 3
@@ -419,12 +419,12 @@ def test_memory_that_gives_out_is_one_line(monkeypatch, capsys, fails, wanted):
     assert re.fullmatch(pattern, capsys.readouterr().err) and Big.alive == 0
 
 
-@pytest.mark.parametrize("name", MEMORY_ADVICE)
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if "--" in command.memory_advice])
 def test_what_to_lower_when_memory_gives_out_exists(name):
-    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
+    command = importlib.import_module(COMMANDS[name].module).COMMAND
     command = command["depth"] if isinstance(command, dict) else command
-    flags = re.findall(r"--[\w.-]+", MEMORY_ADVICE[name])
-    choices = re.findall(r"\w+:[\w-]+", MEMORY_ADVICE[name])
+    flags = re.findall(r"--[\w.-]+", COMMANDS[name].memory_advice)
+    choices = re.findall(r"\w+:[\w-]+", COMMANDS[name].memory_advice)
     assert flags
     for words in [choices[at : at + 1] for at in range(max(1, len(choices)))]:
         helped = io.StringIO()

@@ -13,7 +13,7 @@ from surfkit.cli import main
 from surfkit.cli.table import print_table, tell
 from surfkit.core.check import printable
 from surfkit.core.events import Progress, Warned, emit, say
-from surfkit.run.notes import collect_notes
+from surfkit.runs.notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.bars import bars
 

@@ -10,7 +10,7 @@ from needs import needs_native
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.readers.depth_files import confidence_path, map_path
+from surfkit.io.datasets.depth_files import confidence_path, map_path
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native

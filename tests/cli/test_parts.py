@@ -5,9 +5,9 @@ from itertools import zip_longest
 import pytest
 
 from surfkit.appearance.base import Appearance
+from surfkit.apps.train import Train
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
-from surfkit.cli.train import Train
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
 from surfkit.densify import CountCap, Elongation, Faint, Trim
@@ -35,7 +35,7 @@ def test_parts_are_added_to_a_tuple_one_after_the_other():
 def test_a_part_of_the_recipe_is_swapped_or_taken_away(tmp_path):
     from surfkit.core.codec import write_json
     from surfkit.core.tree import evolve
-    from surfkit.recipes import SURFELS
+    from surfkit.study.recipes import SURFELS
 
     file = tmp_path / "r.json"
     write_json(file, evolve(SURFELS, "pretrain.prune", (Trim(), Faint())))

@@ -8,11 +8,11 @@ import pytest
 import torch
 from needs import needs, needs_native
 
-from surfkit import native
 from surfkit.compress import kmeans as clustering
 from surfkit.compress import nearest as search
 from surfkit.compress.kmeans import Lloyd, kmeans, nearest
 from surfkit.core.check import BadInput
+from surfkit.raster import native
 
 TORCH = "torch"
 ENGINES = [*(native.module().kernels() if native.module() else []), TORCH]

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from surfkit.core.events import FileWritten, StepDone, Warned, emit
-from surfkit.core.registry import hookimpl
+from surfkit.core.hooks import hookimpl
 
 
 class Listener:

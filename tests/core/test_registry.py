@@ -4,7 +4,8 @@ import pytest
 
 from surfkit.core.check import BadInput
 from surfkit.core.describe import settings, summary
-from surfkit.core.registry import Component, components, failures, find, hookimpl, kebab, kind_of, name_of
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component, components, failures, find, kebab, kind_of, name_of
 
 
 def offer(registry, name, **parts):

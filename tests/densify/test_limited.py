@@ -8,7 +8,8 @@ from test_densify import N, step
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
-from surfkit.core.registry import Component, components, hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component, components, plugins
 from surfkit.densify import ADC, CountCap, Limited
 from surfkit.densify.base import Densify, Step
 from surfkit.primitives import Gaussian3D

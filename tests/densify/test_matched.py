@@ -11,7 +11,7 @@ from surfkit.densify import ADC, AbsGradient, CountCap, Limited, LossGradient, M
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.edit import Edit, apply, merge
 from surfkit.primitives.points import Points
-from surfkit.recipe import Recipe
+from surfkit.runs.recipe import Recipe
 from surfkit.scene.scene import Cloud
 from surfkit.testing import check
 from surfkit.testing.inputs import crowd

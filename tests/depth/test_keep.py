@@ -16,10 +16,10 @@ from surfkit.core.events import Warned
 from surfkit.depth import keep, prepare
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.prepare import Preparation
-from surfkit.readers.data import Data
-from surfkit.readers.fingerprint import fingerprint
-from surfkit.readers.made_maps import folder_of, read_made
-from surfkit.readers.read import observations, read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.fingerprint import fingerprint
+from surfkit.io.datasets.made_maps import folder_of, read_made
+from surfkit.io.datasets.read import observations, read
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

@@ -15,9 +15,9 @@ from surfkit.depth.neighbours import in_turn, neighbours
 from surfkit.depth.patch_match import PatchMatch, Work
 from surfkit.depth.plane_map import Map, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.native import module
-from surfkit.readers.data import Data
-from surfkit.readers.read import observations, read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import observations, read
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

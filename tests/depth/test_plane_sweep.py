@@ -15,8 +15,8 @@ from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smooth_costs
-from surfkit.readers.data import Data
-from surfkit.readers.read import observations, read
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import observations, read
 from surfkit.scene.camera import Camera
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

@@ -3,7 +3,8 @@
 import pytest
 
 from surfkit.core.events import Warned
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 
 
 @pytest.fixture

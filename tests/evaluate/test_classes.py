@@ -19,7 +19,7 @@ from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.evaluate.geometry.terrain import terrain
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.seams import Seams
-from surfkit.export.ply import read_vertices
+from surfkit.io.splats.ply import read_vertices
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import up_direction

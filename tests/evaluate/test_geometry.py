@@ -19,7 +19,7 @@ from surfkit.evaluate.geometry.sampling import face_areas, sample_faces
 from surfkit.evaluate.geometry.scores import shares
 from surfkit.evaluate.geometry.surface import Surface, part_within, read_surface
 from surfkit.evaluate.geometry.transform import apply, write_transform
-from surfkit.export.ply import read_vertices, write_points
+from surfkit.io.splats.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop
 from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph

@@ -9,11 +9,11 @@ import torch
 from surfkit.evaluate.images.lpips import Perceptual
 from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.evaluate.images.pictures import panel
-from surfkit.method.base import Reconstruction
 from surfkit.partition import PictureShare, SSIMDifference
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.model import SplatModel
-from surfkit.run.method import with_drawing
+from surfkit.runs.method import with_drawing
+from surfkit.runs.methods.base import Reconstruction
 from surfkit.testing.inputs import coarse_model
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.train.views import ViewContributions

@@ -16,7 +16,7 @@ from surfkit.evaluate.geometry.las import read_las
 from surfkit.evaluate.geometry.place import same_plan
 from surfkit.evaluate.geometry.sampling import face_areas
 from surfkit.evaluate.geometry.surface import Surface, read_surface, system_of
-from surfkit.export.ply import write_points
+from surfkit.io.splats.ply import write_points
 
 trimesh = needs("trimesh")
 BOX = trimesh.creation.box((1, 2, 3))

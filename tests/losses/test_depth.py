@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses import DepthRegression
 from surfkit.losses.base import Target
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim_map
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.testing import check_loss

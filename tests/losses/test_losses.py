@@ -6,13 +6,13 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit import native
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.losses.base import Target
+from surfkit.raster import native
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement, disagreement_reference, normals_of
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 

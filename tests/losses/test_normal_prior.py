@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses import NormalPrior
 from surfkit.losses.base import Target, ignoring
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.raster.select import select
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
 from surfkit.testing.synthetic import Flight, photograph

@@ -8,13 +8,13 @@ import torch
 from needs import needs_native
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import native, tsdf
 from surfkit.mesh.agreement import Agreement, compare, compare_in_torch
 from surfkit.mesh.overlap import Depths, nearby, overlapping
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 
 from .shapes import around, look_at, maps_of, seen, sphere, subject

@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import maximum_flow
 
 from surfkit.mesh.delaunay import tetrahedralised
-from surfkit.native import module
+from surfkit.raster.native import module
 
 pytestmark = needs_native
 

@@ -5,7 +5,7 @@ from needs import needs_native
 
 from surfkit.mesh.cut_tiles import UNKNOWN, Decided, tiles
 from surfkit.mesh.delaunay import tetrahedralised
-from surfkit.native import module
+from surfkit.raster.native import module
 
 pytestmark = needs_native
 

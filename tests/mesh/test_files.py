@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from needs import needs
 
+from surfkit.apps.view.subject import local_mesh
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.mesh.base import Mesh, require_values
 from surfkit.mesh.files import write_mesh
 from surfkit.mesh.simplify import simplify_to
 from surfkit.scene.scene import Frame
-from surfkit.view.subject import local_mesh
 
 trimesh = needs("trimesh")
 SHIFT = (412_300.0, 5_712_300.0, 0.0)

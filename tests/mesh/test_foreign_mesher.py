@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from surfkit.apps.result import mesh_rows
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.cli.result import mesh_rows
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 from surfkit.core.tree import evolve
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.recipes.ablations import TABLES
-from surfkit.report.ablation import Row, Table
+from surfkit.study.ablation import Row, Table
+from surfkit.study.recipes.ablations import TABLES
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 ODD: dict[str, Any] = {

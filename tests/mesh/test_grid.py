@@ -10,7 +10,7 @@ from needs import needs, needs_native
 from surfkit.mesh.lattice import Lattice, Picture
 from surfkit.mesh.native import NativeGrid
 from surfkit.mesh.reference import ReferenceGrid
-from surfkit.native import module
+from surfkit.raster.native import module
 
 from .shapes import around, look_at, seen, slope, sphere, torus
 

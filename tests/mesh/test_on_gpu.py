@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import fusion, tsdf
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.cuda import grid as gpu_grid
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.reference import Reference
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 
 from .shapes import around, subject, torus

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import oversampling
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.oversampling import magnified, oversampled
 from surfkit.mesh.tsdf import TSDF
-from surfkit.readers.depth_prior import DepthPrior
 
 from .shapes import look_at, maps_of, slope, subject, torus
 

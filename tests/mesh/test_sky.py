@@ -6,11 +6,11 @@ from unittest import mock
 import numpy as np
 import torch
 
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import sky as module
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.sky import may_show_sky, sky, without_sky
 from surfkit.mesh.tsdf import TSDF
-from surfkit.readers.depth_prior import DepthPrior
 
 from .shapes import look_at, maps_of, subject
 

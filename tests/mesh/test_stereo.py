@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Splats
-from surfkit.readers.depth_prior import DepthPrior
 
 from .shapes import around, seen, sphere, subject
 

@@ -11,7 +11,8 @@ from needs import needs, needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 from surfkit.mesh import fusion, native, tsdf
 from surfkit.mesh.lattice import SIDE, Lattice, least_slant
 from surfkit.mesh.lengths import LEAST_CUT, without_hidden

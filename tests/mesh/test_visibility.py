@@ -9,7 +9,8 @@ from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import plugins
 from surfkit.mesh.adjust import adjusted, face_normals
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh
@@ -20,7 +21,7 @@ from surfkit.mesh.points import boxes_with, gather, merged
 from surfkit.mesh.sights import Seeing, Sight
 from surfkit.mesh.sights import seen as seen_by_all
 from surfkit.mesh.visibility import OUTWARD, Visibility
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.testing import check_mesher
 
 from .shapes import around, look_at, slope, sphere, subject, torus

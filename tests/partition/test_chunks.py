@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.data import Data
 from surfkit.partition import ContractedGrid, QuantileGrid, SparsePoints, SquareGrid
 from surfkit.partition.plan import Fewest, plan, thinned
-from surfkit.pipeline import run
-from surfkit.readers.data import Data
-from surfkit.recipe import Recipe
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.scene import Frame, View
 from surfkit.testing.inputs import above, coarse_model

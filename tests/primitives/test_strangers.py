@@ -15,11 +15,12 @@ from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.densify.adc import ADC
-from surfkit.export.ply import read_splats
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.io.splats.ply import read_splats
 from surfkit.losses.photometric import L1
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
-from surfkit.pipeline import load_run
 from surfkit.primitives.base import harmonics
 from surfkit.primitives.edit import apply
 from surfkit.primitives.init import seeds
@@ -28,8 +29,7 @@ from surfkit.raster.api import Maps, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.reference import draw
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.runs.pipeline import load_run
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Cloud

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.cuda.emulated import Emulated
 from surfkit.raster.api import MAPS, STANDARD, Maps, Rasterizer
+from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
-from surfkit.raster.native import NativeRasterizer
+from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.reference import Reference
 
 from .cases import case, different_gradients, different_maps

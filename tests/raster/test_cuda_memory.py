@@ -7,9 +7,9 @@ from functools import cache
 import pytest
 import torch
 
-from surfkit.cuda.emulated import Emulated
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.scene.camera import Camera
 from surfkit.testing.simulated_gpu import GPU, simulated_gpu
 

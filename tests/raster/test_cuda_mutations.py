@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from surfkit.cuda.emulated import Emulated, KernelError
 from surfkit.raster.api import Maps
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 
 from .cases import case, different_gradients, different_maps
 from .scenes import NEAR

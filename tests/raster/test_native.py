@@ -7,11 +7,11 @@ import torch
 from needs import needs_native
 from torch import Tensor
 
-from surfkit import native
 from surfkit.core.check import BadInput
+from surfkit.raster import native
 from surfkit.raster.api import ALPHA_MIN, MAPS, STANDARD, Maps, Render, Splats
+from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.footprints import footprints
-from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference, draw
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera

@@ -6,7 +6,7 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit.raster.native import NativeRasterizer
+from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.outlook import may_touch
 from surfkit.raster.reference import Reference
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster.native import NativeRasterizer
+from surfkit.raster import native
+from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.rays import ray_opacity, ray_opacity_reference
 from surfkit.raster.reference import Reference
 

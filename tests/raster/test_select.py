@@ -9,12 +9,13 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit import hookimpl, native
+from surfkit import hookimpl
 from surfkit.core import registry
 from surfkit.core.check import BadInput
+from surfkit.raster import native
+from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.cuda import gpu
 from surfkit.raster.cuda.gpu import CudaRasterizer
-from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select, torch_device
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit import native
+from surfkit.raster import native
 from surfkit.raster.ssim import ssim, ssim_reference
 
 from .scenes import Draw

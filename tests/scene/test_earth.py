@@ -3,13 +3,12 @@
 import numpy as np
 import pyproj
 import pytest
+from grids import plane, write_gtx
 from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.scene.earth import Site, from_utm, on_earth, to_ecef, utm
 from surfkit.scene.geoid import geoid_of
-
-from .grids import plane, write_gtx
 
 LOCAL = "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"
 PROJ_ECEF = [  # pyproj 3.7, to EPSG:4978

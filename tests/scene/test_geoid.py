@@ -3,12 +3,11 @@
 import numpy as np
 import pyproj
 import pytest
+from grids import plane, write_gtx
 from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.scene.geoid import geoid_of
-
-from .grids import plane, write_gtx
 
 LATITUDE, LONGITUDE = np.array([53.01, 52.1, 50.0]), np.array([8.27, 7.33, 5.0])
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from surfkit.core.codec import write_json
-from surfkit.readers.depth_files import map_path, write_map
-from surfkit.readers.depth_layout import DepthQuery
-from surfkit.readers.depth_layouts import HierarchicalDepths
-from surfkit.run.notes import collect_notes
+from surfkit.io.datasets.depth_files import map_path, write_map
+from surfkit.io.datasets.depth_layout import DepthQuery
+from surfkit.io.datasets.depth_layouts import HierarchicalDepths
+from surfkit.runs.notes import collect_notes
 from surfkit.scene.names import find_files, safe_path
 
 

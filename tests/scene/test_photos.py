@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.readers.capture import load_pycolmap
+from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.scene import photos
 from surfkit.scene.camera import Camera
 from surfkit.scene.copies import Copies

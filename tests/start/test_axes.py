@@ -7,13 +7,13 @@ import pytest
 import torch
 from models import ORIGIN, data_set, like_3dgs
 
-from surfkit.export.axes import turn_between
-from surfkit.export.files import read_splat_file
-from surfkit.export.spz import SPZ
-from surfkit.export.turn import turned
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
-from surfkit.run.notes import collect_notes
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.io.splats.axes import turn_between
+from surfkit.io.splats.files import read_splat_file
+from surfkit.io.splats.spz import SPZ
+from surfkit.io.splats.turn import turned
+from surfkit.runs.notes import collect_notes
 from surfkit.start.axes import read_in_scene
 from surfkit.start.base import StartInput
 from surfkit.start.splats import SplatStart

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.start import carve, closing
 from surfkit.start.base import StartInput

@@ -11,13 +11,13 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import LearningRate
 from surfkit.core.tree import evolve
-from surfkit.export.ply import read_splats, write_splats
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.io.splats.ply import read_splats, write_splats
 from surfkit.partition import QuantileGrid
-from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.runs.pipeline import Intervals, load_run, run, with_steps
 from surfkit.start.base import StartInput
 from surfkit.start.splats import SplatStart
 from surfkit.testing import check_start

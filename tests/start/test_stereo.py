@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.core.registry import components
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
 from surfkit.start.base import Start, StartInput
 from surfkit.start.depth_points import normals_of

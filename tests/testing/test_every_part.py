@@ -3,14 +3,14 @@
 import pytest
 
 import surfkit.testing
+from surfkit.compress.levels import MergedLevels, PrunedLevels
 from surfkit.core.check import BadInput
 from surfkit.core.registry import kebab, kind_of, offered
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.execute.slurm import Slurm
-from surfkit.lod import MergedLevels, PrunedLevels
+from surfkit.io.datasets.base import Reader
 from surfkit.mesh.poisson import Poisson
 from surfkit.primitives.base import Primitive
-from surfkit.readers.base import Reader
+from surfkit.runs.execute.slurm import Slurm
 from surfkit.testing import check
 
 OFFERED = {
@@ -29,16 +29,16 @@ QUICK = {
 CANNOT = ("needs the package", "surfkit was installed without", "one without CUDA", "finds no NVIDIA GPU")
 """What errors say of parts that this machine cannot use."""
 ELSEWHERE = {
-    "executor:ray": "tests/execute/test_ray.py has a cluster for it",
+    "executor:ray": "tests/runs/execute/test_ray.py has a cluster for it",
     "encoding:codes": "tests/compress/test_encodings.py has codebooks for it",
     "encoding:principal-components": "tests/compress/test_encodings.py has a basis for it",
-    "method:splats": "tests/test_pipeline.py and most others train with it",
-    "method:import": "tests/method/test_imported.py has a file for it",
+    "method:splats": "tests/runs/test_pipeline.py and most others train with it",
+    "method:import": "tests/runs/methods/test_imported.py has a file for it",
     "start:splats": "tests/start/test_splats.py has a file for it",
-    "method:stereo": "tests/method/test_method.py makes the depth maps for it",
-    "feature-extractor:disk": "tests/sfm/test_learnt.py has weights for it",
-    "feature-extractor:aliked": "tests/sfm/test_learnt.py has weights for it",
-    "feature-matcher:lightglue": "tests/sfm/test_learnt.py has weights for it",
+    "method:stereo": "tests/runs/methods/test_method.py makes the depth maps for it",
+    "feature-extractor:disk": "tests/apps/sfm/test_learnt.py has weights for it",
+    "feature-extractor:aliked": "tests/apps/sfm/test_learnt.py has weights for it",
+    "feature-matcher:lightglue": "tests/apps/sfm/test_learnt.py has weights for it",
     "depth-estimator:depth-anything-v2": "tests/depth/test_depth_anything.py has weights for it",
 }
 

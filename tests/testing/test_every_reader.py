@@ -2,20 +2,21 @@
 
 from dataclasses import dataclass, replace
 
+import exchange_files as exchange
 import numpy as np
+import program_files as programs
 import pytest
-from scene import exchange, programs
-from scene.folders import FLIGHT, blender, city, nerfstudio, odm
+from data_set_folders import FLIGHT, blender, city, nerfstudio, odm
 
 from surfkit.core.registry import components
-from surfkit.readers.base import Reader
-from surfkit.readers.colmap import COLMAP
+from surfkit.io.datasets.base import Reader
+from surfkit.io.datasets.colmap import COLMAP
 from surfkit.testing import check, check_reader
 from surfkit.testing.synthetic import photograph, write_colmap
 
 PROGRAMS = ("bundler", "metashape", "openmvg", "pix4d", "realitycapture")
 EXCHANGE = ("blocks-exchange", "opf", "polycam", "record3d", "xmp-sidecars")
-"""Written with a scene of their own: `scene/test_programs.py` and `test_exchange.py` compare cameras with formulas."""
+"""Written with a scene of their own: test_programs.py and test_exchange.py compare cameras with formulas."""
 
 
 def program(name):

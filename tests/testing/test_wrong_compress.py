@@ -12,7 +12,7 @@ from surfkit.compress.encoding import Encoding, flat, stream
 from surfkit.compress.packed import Packed
 from surfkit.compress.plain import Lossless
 from surfkit.compress.scalars import Floats, float_bits
-from surfkit.core import registry
+from surfkit.core import hooks, registry
 from surfkit.primitives.columns import standard_columns
 from surfkit.testing import check_compressor, check_encoding
 
@@ -232,7 +232,7 @@ class Crashes(Own):
 
 
 class Package:
-    @registry.hookimpl
+    @hooks.hookimpl
     def surfkit_components(self):
         return {cls.__name__.lower(): cls for cls in (Halves, Own, *Own.__subclasses__())}
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from surfkit.execute.base import Executor, Inline, JobResult
+from surfkit.runs.execute.base import Executor, Inline, JobResult
 from surfkit.testing import check_executor, executors
 
 

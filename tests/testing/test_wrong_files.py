@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.export.base import Format
-from surfkit.export.table import COLUMNS
+from surfkit.io.splats.base import Format
+from surfkit.io.splats.table import COLUMNS
 from surfkit.testing import check_format
 
 
@@ -29,7 +29,7 @@ class Saved(Format):
         return table
 
     def read(self, path):
-        from surfkit.export.table import SplatTable
+        from surfkit.io.splats.table import SplatTable
 
         try:
             return SplatTable(*torch.load(path)["values"])
@@ -110,7 +110,7 @@ class NoNumbers(Saved):
 
 class Trusts(Saved):
     def read(self, path):
-        from surfkit.export.table import SplatTable
+        from surfkit.io.splats.table import SplatTable
 
         return SplatTable(*torch.load(path)["values"])
 

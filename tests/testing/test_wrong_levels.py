@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.lod import LevelsOfDetail, MergedLevels
-from surfkit.lod.tree import LodBlock, LodTree
+from surfkit.compress.levels import LevelsOfDetail, MergedLevels
+from surfkit.compress.levels.tree import LodBlock, LodTree
 from surfkit.testing import check_levels_of_detail
 
 

@@ -7,11 +7,11 @@ import torch
 
 from surfkit.partition.assign import Assign, PictureShare
 from surfkit.partition.base import Cells, Ground, Partition
-from surfkit.refine import PruneAndRecover
-from surfkit.refine.base import Refine
 from surfkit.start.base import InitialModel, Start
 from surfkit.start.plain import SparseStart
 from surfkit.testing import check_assign, check_partition, check_refine, check_start
+from surfkit.train.refine import PruneAndRecover
+from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
 
 FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))

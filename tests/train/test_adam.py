@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 
-from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import LearningRate
 from surfkit.primitives.points import Points
+from surfkit.raster import native
 from surfkit.train.adam import UPDATED, adam_step
 
 

@@ -10,16 +10,16 @@ import torch
 
 from surfkit.appearance.base import Appearance
 from surfkit.core.registry import components
-from surfkit.cuda.emulated import Emulated
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Filter, Prune, Signal
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.primitives.base import Primitive
 from surfkit.raster.cuda.gpu import CudaRasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage

@@ -6,9 +6,10 @@ import pytest
 
 from surfkit.core import memory
 from surfkit.core.events import MemoryTaken
+from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import peak_memory_bytes, reset_peak_memory
-from surfkit.core.registry import hookimpl, plugins
-from surfkit.run.notes import Notes
+from surfkit.core.registry import plugins
+from surfkit.runs.notes import Notes
 from surfkit.train.memory_meter import MemoryMeter
 
 LARGE = 300_000_000

@@ -16,9 +16,9 @@ from surfkit.core.schedule import LearningRate
 from surfkit.densify import MatchedADC
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.report.ablation import build, offered_tables
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
+from surfkit.study.ablation import build, offered_tables
 from surfkit.train.trainer import Trainer
 
 

@@ -15,7 +15,7 @@ from surfkit.core.codec import dump, load
 from surfkit.core.registry import plugins
 from surfkit.depth import DepthAnythingV2, PlaneSweep
 from surfkit.mesh.tsdf import TSDF
-from surfkit.native import module
+from surfkit.raster.native import module
 from surfkit.testing import check
 from surfkit.testing.inputs import mesh_input
 

@@ -20,11 +20,11 @@ from surfkit_neus.train import CHECKPOINT, make_step, train
 from surfkit import BadInput, Camera, Cloud, Frame, MethodInput, Scene, StepDone, View, components, hookimpl
 from surfkit.cli import main
 from surfkit.core.registry import plugins
-from surfkit.method.base import Method
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import DepthPrior
-from surfkit.report.ablation import build, offered_tables
+from surfkit.runs.methods.base import Method
+from surfkit.study.ablation import build, offered_tables
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

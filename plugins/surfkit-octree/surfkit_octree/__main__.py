@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit import BadInput, Camera, Columns
-from surfkit.pipeline import load_run
+from surfkit.runs.pipeline import load_run
 from surfkit_octree.anchors import Anchors
 from surfkit_octree.levels import TABLE, Census, LevelTable, census
 

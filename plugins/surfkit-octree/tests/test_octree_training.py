@@ -14,10 +14,10 @@ from surfkit_octree.levels import TABLE, LevelTable
 from surfkit import Densify, LearningRate, Points, components
 from surfkit.cli import main
 from surfkit.core.registry import plugins
-from surfkit.pipeline import with_steps
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.runs.pipeline import with_steps
 from surfkit.scene.photos import photo_cache
 from surfkit.start.base import StartInput
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

@@ -17,9 +17,9 @@ from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement_reference
 from surfkit.raster.select import select
-from surfkit.report.ablation import build, offered_tables
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
+from surfkit.study.ablation import build, offered_tables
 from surfkit.train.trainer import Trainer
 
 

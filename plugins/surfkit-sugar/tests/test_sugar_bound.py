@@ -15,17 +15,17 @@ from surfkit_sugar.bound import sound
 from surfkit_sugar.triangles import ellipses, frames, packed, pairs
 
 from surfkit import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, components, evolve, hookimpl
-from surfkit.blocks.schedule import Compute
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.export.ply import read_splats
+from surfkit.io.datasets.data import Data
+from surfkit.io.splats.ply import read_splats
 from surfkit.mesh.poisson import require_open3d
 from surfkit.mesh.simplify import require_simplification
-from surfkit.pipeline import load_run, run
 from surfkit.primitives import Surfel2D
-from surfkit.readers.data import Data
-from surfkit.run.stage import Intervals
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.pipeline import load_run, run
+from surfkit.runs.stage import Intervals
 from surfkit.scene.rotations import rotations
 from surfkit.testing import check
 from surfkit.testing.inputs import mesh_input, splats

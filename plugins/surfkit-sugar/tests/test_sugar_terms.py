@@ -20,7 +20,7 @@ from surfkit.core.schedule import rescale
 from surfkit.losses.base import Target
 from surfkit.primitives.edit import Edit, apply
 from surfkit.raster.select import select
-from surfkit.run.shared import part_keys
+from surfkit.runs.shared import part_keys
 from surfkit.testing import check
 from surfkit.testing.inputs import above, crowd, splats, survey
 from surfkit.train import checkpoint

@@ -10,7 +10,7 @@
 #include <string>
 #include <vector>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 #include "nearest.h"
 
 namespace nb = nanobind;

@@ -9,7 +9,7 @@
 #include <cmath>
 #include <limits>
 
-#include "../../native/simd.h"
+#include "../../raster/native/simd.h"
 
 #define SURFKIT_PASTE(a, b) a##b
 #define SURFKIT_TABLE(name) SURFKIT_PASTE(nearest_kernels_, name)

@@ -14,7 +14,7 @@
 #include <string>
 #include <vector>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 #include "agreement.h"
 #include "stereo.h"
 

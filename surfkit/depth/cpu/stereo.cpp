@@ -10,7 +10,7 @@
 #include <cmath>
 #include <numeric>
 
-#include "../../native/simd.h"
+#include "../../raster/native/simd.h"
 
 #define SURFKIT_PASTE(a, b) a##b
 #define SURFKIT_TABLE(name) SURFKIT_PASTE(stereo_kernels_, name)

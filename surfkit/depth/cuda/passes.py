@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.cuda.modules import Kernels, kernels
-from surfkit.cuda.source import Source
 from surfkit.depth.native import Grey, Planes, Terms, gains, pattern, way
-from surfkit.native import module
+from surfkit.raster.native import module
+from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.raster.nvrtc.source import Source
 from surfkit.scene.camera import Camera
 
 WIDE, HIGH = 32, 4

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.export.ply import TYPES, element_layout, open_header
+from surfkit.io.splats.ply import TYPES, element_layout, open_header
 
 LIST = "property list "
 

@@ -14,7 +14,7 @@ from pyproj.exceptions import CRSError
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.export.glb import read_glb
+from surfkit.io.glb import read_glb
 
 Y_UP, Z_UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

@@ -15,8 +15,8 @@ from surfkit.evaluate.geometry.heights import RASTERS, raster_system, read_heigh
 from surfkit.evaluate.geometry.las import CLOUDS, SCANS, las_notes, read_e57, read_las
 from surfkit.evaluate.geometry.lists import fans, has_lists, points_beside_lists
 from surfkit.evaluate.geometry.place import notes_in, offset_in, place_of, root_of
-from surfkit.export.ply import TYPES, read_vertices
-from surfkit.readers.sparse_ply import read_points
+from surfkit.io.datasets.sparse_ply import read_points
+from surfkit.io.splats.ply import TYPES, read_vertices
 
 BLOCK = 1 << 20
 """Points in memory at a time."""
@@ -135,6 +135,14 @@ def read_surface(path: Path) -> Surface:
     if found.faces is not None and not len(found.faces):
         raise BadInput(f"{path}: a mesh without faces, so there is no surface to measure; make the mesh again")
     return _sound(found)
+
+
+def read_mesh(path: Path) -> Surface:
+    """The mesh in a file; BadInput for a cloud of points."""
+    found = read_surface(path)
+    if found.faces is None:
+        raise BadInput(f"{path}: a cloud of points; name a mesh")
+    return found
 
 
 def _ply(path: Path) -> Surface:

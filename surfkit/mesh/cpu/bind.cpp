@@ -10,7 +10,7 @@
 #include <optional>
 #include <string>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 #include "agree.h"
 #include "collapse.h"
 #include "grid.h"

@@ -7,7 +7,7 @@
 #include <numeric>
 #include <vector>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 #include "cut.h"
 #include "delaunay.h"
 #include "grid.h"

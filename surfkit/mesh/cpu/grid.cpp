@@ -6,7 +6,7 @@
 #include <cstring>
 #include <new>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 
 namespace surfkit {
 namespace {

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <vector>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 
 namespace surfkit {
 namespace {

@@ -2,7 +2,7 @@
 #include <algorithm>
 #include <cstring>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 #include "grid.h"
 
 namespace surfkit {

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.cuda.modules import Kernels, kernels
-from surfkit.cuda.source import Source
 from surfkit.mesh.lattice import BITS, BLOCK_BYTES, MOST, REACH, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
+from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.raster.nvrtc.source import Source
 from surfkit.scene.camera import Camera
 
 THREADS = 128

@@ -11,7 +11,7 @@
 
 #include "pass.h"
 #include "rays.h"
-#include "../../native/pool.h"
+#include "../native/pool.h"
 
 namespace nb = nanobind;
 

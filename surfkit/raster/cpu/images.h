@@ -2,8 +2,8 @@
 // like it compiled once per instruction set.
 #pragma once
 
-#include "../../native/buffer.h"
-#include "../../native/simd.h"
+#include "../native/buffer.h"
+#include "../native/simd.h"
 #include "kernels.h"
 
 namespace surfkit {

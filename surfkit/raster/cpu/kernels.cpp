@@ -3,7 +3,7 @@
 //
 // A tile of 16 x 16 pixels is cut into blocks of 4 x (lanes / 4), one vector each. For each splat the rows of its
 // footprint tell which blocks it can touch; blocks whose rays have all ended are left out.
-#include "../../native/simd.h"
+#include "../native/simd.h"
 
 #define SPLAT_FN static SURFKIT_INLINE
 #include "doubles.h"

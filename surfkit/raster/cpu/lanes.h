@@ -2,7 +2,7 @@
 // double is, so that all compilations give the same bits.
 #pragma once
 
-#include "../../native/simd.h"
+#include "../native/simd.h"
 
 namespace {
 

@@ -6,7 +6,7 @@
 #include <numeric>
 #include <stdexcept>
 
-#include "../../native/pool.h"
+#include "../native/pool.h"
 
 namespace surfkit {
 namespace {

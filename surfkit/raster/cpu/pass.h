@@ -6,7 +6,7 @@
 
 #include "doubles.h"
 #include "../project.h"
-#include "../../native/buffer.h"
+#include "../native/buffer.h"
 #include "kernels.h"
 
 namespace surfkit {

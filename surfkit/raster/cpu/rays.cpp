@@ -2,7 +2,7 @@
 
 #include <limits>
 
-#include "../../native/pool.h"
+#include "../native/pool.h"
 
 namespace surfkit {
 namespace {

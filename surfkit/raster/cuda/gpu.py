@@ -9,11 +9,11 @@ from typing import ClassVar
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.cuda.driver import driver
-from surfkit.cuda.modules import Kernels, kernels
-from surfkit.cuda.nvrtc import nvrtc
-from surfkit.cuda.source import Source
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.nvrtc.driver import driver
+from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.raster.nvrtc.nvrtc import nvrtc
+from surfkit.raster.nvrtc.source import Source
 
 
 @dataclass(frozen=True)

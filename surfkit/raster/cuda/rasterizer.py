@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.cuda.modules import Kernels
-from surfkit.cuda.source import Source
 from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.nvrtc.modules import Kernels
+from surfkit.raster.nvrtc.source import Source
 from surfkit.raster.outlook import may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surfkit.cuda.modules import Kernels, kernels
-from surfkit.cuda.source import Source
+from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.raster.nvrtc.source import Source
 
 SOURCE = Source(Path(__file__).with_name("ssim.cu"))
 TILE = (32, 16)

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "../../native/pool.h"
+#include "../../raster/native/pool.h"
 
 namespace surfkit {
 namespace {

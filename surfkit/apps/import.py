@@ -1,0 +1,72 @@
+"""`surfkit import`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.apps.result import show
+from surfkit.core.registry import choice
+from surfkit.io.datasets.data import Reading
+from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.models import existing_model
+from surfkit.mesh.base import Mesher
+from surfkit.mesh.tsdf import TSDF
+from surfkit.raster.select import Device
+from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.folder import Run
+from surfkit.runs.methods.imported import SplatImport
+from surfkit.runs.pipeline import run
+from surfkit.study.recipes import IMPORTED
+from surfkit.train.data_cache import CacheSettings
+
+
+@dataclass(frozen=True)
+class Import:
+    """Take splats from a file of any program into a run folder, and measure and mesh them on the photographs.
+
+    Nothing is optimised. `surfkit evaluate`, `mesh` and `export` work on the folder, and `surfkit train recipe:2dgs
+    start:splats --start.file FILE` trains the splats further. Coordinates must be those of the data set (its COLMAP
+    model).
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """File of splats of any format that `surfkit components format` lists, such as a PLY file of 3DGS or 2DGS, or the
+    folder of a finished run."""
+
+    data: Path
+    """Data set that the splats were made from: images/ and a COLMAP model in sparse/0, or another layout."""
+
+    out: Path | None = None
+    """Run folder. Default: runs/DATA-FILE."""
+
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in the file, as SPZ names them: rdf for right, down, forward, those of a PLY file, which are
+    taken as they are. auto: those that the file or its format names, else those that fit the photographs best."""
+
+    mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = field(default_factory=TSDF)
+    """How the splats become triangles; none for no mesh."""
+
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    """How the data set is read."""
+
+    device: Device = "auto"
+    """Device for rendering."""
+
+    cache: str = "auto"
+    """Memory for photographs and masks, such as 4GB or 500MB; auto is half of the free memory."""
+
+    def run(self) -> None:
+        """Import, and print the results."""
+        existing_model(self.file, "FILE")
+        data = self.reading.of(self.data)
+        out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.file.resolve().stem}"
+        recipe = replace(IMPORTED, method=SplatImport(self.file, self.axes), mesh=self.mesh)
+        metrics = run(recipe, data, out, Compute(self.device), caches=CacheSettings(self.cache))
+        show(Run(out, recipe, data), metrics)
+
+
+COMMAND = Import

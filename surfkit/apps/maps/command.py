@@ -1,0 +1,141 @@
+"""`surfkit maps`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from surfkit.apps.maps.grid import same_crs
+from surfkit.apps.maps.make import RECORD, MapSettings, make_maps
+from surfkit.apps.texture.make import Subject
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.evaluate.geometry.highest import highest
+from surfkit.evaluate.geometry.place import same_plan
+from surfkit.evaluate.geometry.surface import Surface, read_mesh, read_surface, system_of
+from surfkit.runs.command import refuse_no_mesh
+from surfkit.runs.notes import collect_notes
+from surfkit.runs.pipeline import opened
+from surfkit.runs.resume import read_unchanged
+from surfkit.runs.warn import note_held_out
+from surfkit.scene.scene import Frame
+from surfkit.train.bars import bars
+
+
+@dataclass(frozen=True)
+class MapsOf:
+    """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud.
+
+    Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
+    --against, the heights of another mesh are subtracted. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
+    RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same
+    command goes on where it stopped.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    out: Path | None = None
+    """Folder for the maps; by default RUN/maps."""
+
+    settings: Annotated[MapSettings, tyro.conf.arg(name="")] = MapSettings()
+    """What is drawn."""
+
+    against: Path | None = None
+    """A run, or a file in the same coordinates, with a mesh, a raster of heights (GeoTIFF) or a cloud (LAS, LAZ, PLY):
+    also write the heights of RUN minus those of this one, as GeoTIFF and as a picture, with the volumes by which RUN
+    lies above (fill) and below (cut)."""
+
+    metres_per_unit: float | None = None
+    """Metres per unit of the data set's coordinates, if the data set does not state it."""
+
+    def __post_init__(self) -> None:
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
+            raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
+
+    def run(self) -> None:
+        """Draw the maps, and print what they are."""
+        self.settings.refuse_missing()
+        run = opened(self.run_folder)
+        refuse_no_mesh(run)
+        out = self.out or run.out / "maps"
+        with collect_notes(), bars():
+            scene, surface = read_unchanged(run), read_mesh(run.mesh)
+            frame = scene.frame
+            if self.metres_per_unit is not None:
+                frame = replace(frame, metres=self.metres_per_unit)
+            other = None if self.against is None else self._other(frame)
+            record = make_maps(Subject(surface, frame, scene.train), self.settings, out, other)
+            note_held_out(run, scene)
+        show(out, record)
+
+    def _other(self, frame: Frame) -> Surface:
+        """The mesh to subtract; BadInput if it is known to lie in other coordinates."""
+        if not self.against.is_dir():
+            theirs = system_of(self.against)
+            if theirs is not None and frame.crs is not None and not same_plan(theirs, frame.crs):
+                raise BadInput(
+                    f"--against {self.against}: its coordinates are in {theirs}, and those of {self.run_folder} in "
+                    f"{frame.crs}; heights can be subtracted in one system only"
+                )
+            return heights_of(self.against)
+        run = opened(self.against)
+        refuse_no_mesh(run)
+        theirs = read_unchanged(run).frame
+        if not same_crs(theirs.crs, frame.crs):
+            raise BadInput(
+                f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "
+                f"of {self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
+            )
+        if frame.crs is None:
+            emit(Warned("neither run is georeferenced; their coordinates are taken to be the same"))
+        return read_mesh(run.mesh)
+
+
+def heights_of(path: Path) -> Surface:
+    """The surface in a file whose heights can be subtracted: a mesh, a raster of heights, or the highest points of a
+    cloud."""
+    found = read_surface(path)
+    if "f_dc_0" in (found.rows.dtype.names or ()):
+        raise BadInput(f"{path}: splats, which are no surface; name a mesh, a raster of heights or a cloud")
+    return highest(found) if found.faces is None else found
+
+
+def show(out: Path, record: dict[str, Any]) -> None:
+    """Print what the maps are, and the paths of what was written."""
+    unit = record["unit"]
+    rows = [
+        ("coordinates", record["coordinates"]),
+        ("up", record["up"]),
+        ("ground sampling distance", f"{record['gsd']:g} {unit}"),
+        ("size", "{} x {} cells".format(*record["size"])),
+        ("covered", f"{record['covered']:.1%}"),
+        ("heights", "{:.2f} to {:.2f} {}".format(*record["heights"], unit)),
+    ]
+    if found := record.get("orthophoto"):
+        rows.append(("orthophoto", f"{found['from_photographs']:.1%} of it from photographs, the rest from the mesh"))
+    if found := record.get("contours"):
+        rows.append(("contour lines", f"{found['lines']:,}, every {found['interval']:g} {unit}"))
+    if found := record.get("points"):
+        rows.append(("points", f"{found['points']:,}, one for {found['spacing']:g} x {found['spacing']:g} {unit}"))
+    if found := record.get("difference"):
+        rows += [
+            ("above (fill)", f"{found['fill']:,.6g} {unit}³ on {found['area']:,.6g} {unit}² compared"),
+            ("below (cut)", f"{found['cut']:,.6g} {unit}³"),
+            ("difference of heights", f"median {found['median']:.4g} {unit}"),
+            (
+                "its absolute value",
+                f"median {found['median_absolute']:.4g}, 90 % under {found['percentile_90']:.4g} {unit}",
+            ),
+            ("no surface", f"{found['only_other']:,} cells here, {found['only_here']:,} cells there"),
+        ]
+    print_table(("map", "value"), rows)
+    print()
+    print_table(("written",), [(str(out / name),) for name in (*record["files"], RECORD)])
+
+
+COMMAND = MapsOf

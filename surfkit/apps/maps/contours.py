@@ -1,0 +1,134 @@
+"""Contour lines of a surface model, as a GeoPackage."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.apps.maps.geotiff import TILES, Sheet
+from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.hillshade import read_heights
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.core.files import replacing
+from surfkit.core.optional import needed
+
+STEPS = 20
+"""About how many levels an automatic interval gives."""
+MOST_LEVELS = 10_000
+"""Of a map."""
+LINE = 2
+"""LineString in well-known binary."""
+
+
+def even_interval(lowest: float, highest: float) -> float:
+    """1, 2 or 5 times a power of ten, so that there are 20 levels or somewhat fewer between two heights."""
+    least = max((highest - lowest) / STEPS, 1e-9 * max(abs(lowest), abs(highest), 1e-9))
+    power = 10.0 ** math.floor(math.log10(least))
+    return float(f"{next(step * power for step in (1, 2, 5, 10) if step * power >= least * (1 - 1e-9)):.1g}")
+
+
+def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side: int) -> int:
+    """Write the contour lines of a surface model of `sheet.out`, and return how many there are.
+
+    Lines are cut where tiles meet, and their ends are the same there to the last bit. They end where there is no
+    surface.
+
+    Args:
+        sheet: Where.
+        heights: File name of the surface model.
+        name: File name of the GeoPackage: a layer `contours` with a field `elevation`.
+        interval: Between levels, units of the input; levels are its multiples.
+        side: Of a tile, cells.
+    """
+    with needed("pyogrio", "contour lines"):
+        from pyogrio.raw import write
+    import rasterio
+
+    grid, path, count = sheet.grid, sheet.folder / name, 0
+    windows, tiles = list(grid.tiles(side)), sheet.folder / f"{name}{TILES}"
+    tiles.mkdir(exist_ok=True)
+    with rasterio.open(sheet.out / heights) as model:
+        for at, window in enumerate(windows):
+            wide, high = (
+                min(window.width + 1, grid.width - window.left),
+                min(window.height + 1, grid.height - window.top),
+            )
+            part = Window(window.left, window.top, wide, high)
+            if not (tiles / f"{at}.npz").exists():
+                _keep(contour_lines(read_heights(model, part), grid, part, interval), tiles / f"{at}.npz")
+            emit(Progress("contour lines", at + 1, len(windows)))
+    layer = {"layer": "contours", "driver": "GPKG", "geometry_type": "LineString", "crs": sheet.crs.to_wkt()}
+    for rest in sheet.folder.glob(f"{name}*"):
+        if rest != tiles:  # of an interrupted call
+            rest.unlink()
+    for at in range(len(windows)):
+        lines = _kept(tiles / f"{at}.npz")
+        if lines or not path.exists():
+            shapes = np.array([_binary(line) for _, line in lines], object)
+            levels = np.array([level for level, _ in lines], np.float64)
+            write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
+        count += len(lines)
+        emit(Progress("writing contour lines", at + 1, len(windows)))
+    sheet.deliver(path)
+    return count
+
+
+def _keep(lines: list[tuple[float, np.ndarray]], path: Path) -> None:
+    """Keep the levels and lines of a tile."""
+    levels, places = [level for level, _ in lines], [line for _, line in lines]
+    with replacing(path) as file:
+        ends = np.cumsum([len(line) for line in places], dtype=np.int64)
+        np.savez(
+            file, levels=np.array(levels, np.float64), ends=ends, places=np.concatenate([*places, np.empty((0, 2))])
+        )
+
+
+def _kept(path: Path) -> list[tuple[float, np.ndarray]]:
+    """What was kept."""
+    with np.load(path) as found:
+        lines = np.split(found["places"], found["ends"])[:-1]
+        return list(zip(found["levels"].tolist(), lines, strict=True))
+
+
+def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: float) -> list[tuple[float, np.ndarray]]:
+    """Levels and lines, (n, 2) float64 easting and northing, of the heights at the centres of a window of cells.
+
+    Between centres heights are linear along the sides of the squares of four of them, as in all programs.
+
+    Args:
+        heights: (H, W) float64; NaN where there is no surface.
+        grid: The map.
+        window: Of the map.
+        interval: Between levels.
+
+    Raises:
+        BadInput: Too many levels.
+    """
+    from contourpy import contour_generator
+
+    known = np.isfinite(heights)
+    if min(heights.shape) < 2 or not known.any():
+        return []
+    first, last = math.ceil(heights[known].min() / interval), math.floor(heights[known].max() / interval)
+    if last - first > MOST_LEVELS:
+        raise BadInput(f"--interval {interval:g}: more than {MOST_LEVELS:,} levels; give a larger one")
+    columns = np.arange(window.left, window.left + window.width) + 0.5
+    rows = np.arange(window.top, window.top + window.height) + 0.5
+    tracer = contour_generator(columns, rows, np.ma.masked_array(heights, ~known))
+    found = []
+    for level in range(first, last + 1):
+        height = float(f"{level * interval:.12g}")  # 0.3 and not 0.30000000000000004, as labels show it
+        for line in tracer.lines(height):
+            if len(line) > 1:
+                place = np.stack([grid.west + line[:, 0], grid.north - line[:, 1]], axis=1) * grid.gsd
+                found.append((height, place))
+    return found
+
+
+def _binary(line: np.ndarray) -> bytes:
+    """Well-known binary of a line of (n, 2) float64."""
+    return struct.pack("<BII", 1, LINE, len(line)) + line.astype("<f8").tobytes()

@@ -1,0 +1,62 @@
+"""The surface model in the light of a low sun."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from surfkit.apps.maps.geotiff import Sheet
+from surfkit.apps.maps.grid import Window
+from surfkit.apps.maps.rasters import NODATA, window_of
+from surfkit.core.events import Progress, emit
+
+AZIMUTH, ALTITUDE = 315.0, 45.0
+"""Degrees: the light comes from the north-west, as maps have it."""
+
+
+def draw_hillshade(sheet: Sheet, heights: str, name: str, side: int) -> None:
+    """Write the hillshade of a surface model of `sheet.out`, in tiles of so many cells."""
+    import rasterio
+
+    windows = list(sheet.grid.tiles(side))
+    with rasterio.open(sheet.out / heights) as model, sheet.raster(name, "shades") as file:
+        for at, window in enumerate(windows):
+            if file.facts(window) is None:
+                file.write(hillshade(_with_margin(model, window), sheet.grid.gsd), window, {})
+            emit(Progress("shading", at + 1, len(windows)))
+
+
+def hillshade(heights: np.ndarray, gsd: float) -> np.ndarray:
+    """(H, W) uint8 of (H + 2, W + 2) float64 heights: 1 to 255, 0 where a height or one of its neighbours is NaN.
+
+    Slopes are those of Horn (1981), weighted differences over 3 x 3 cells; light falls on them by Lambert's law.
+    """
+    rows, columns = heights[:-2] + 2 * heights[1:-1] + heights[2:], heights[:, :-2] + 2 * heights[:, 1:-1]
+    columns = columns + heights[:, 2:]
+    east = (rows[:, 2:] - rows[:, :-2]) / (8 * gsd)
+    north = (columns[:-2] - columns[2:]) / (8 * gsd)
+    azimuth, altitude = math.radians(AZIMUTH), math.radians(ALTITUDE)
+    flat = math.cos(altitude)
+    light = math.sin(altitude) - flat * (east * math.sin(azimuth) + north * math.cos(azimuth))
+    share = (light / np.sqrt(1 + east**2 + north**2)).clip(0) + 0 * heights[1:-1, 1:-1]
+    return np.where(np.isfinite(share), np.rint(1 + 254 * share), 0).astype(np.uint8)
+
+
+def _with_margin(model: object, window: Window) -> np.ndarray:
+    """(H + 2, W + 2) float64 heights of a window and the cells around it; NaN where there is no surface."""
+    left, top = max(0, window.left - 1), max(0, window.top - 1)
+    right = min(model.width, window.left + window.width + 1)
+    below = min(model.height, window.top + window.height + 1)
+    inner = Window(left, top, right - left, below - top)
+    found = np.full((window.height + 2, window.width + 2), np.nan)
+    row, column = top - window.top + 1, left - window.left + 1
+    found[row : row + inner.height, column : column + inner.width] = read_heights(model, inner)
+    return found
+
+
+def read_heights(model: object, window: Window) -> np.ndarray:
+    """(H, W) float64 heights of a window of an open surface model; NaN where there is no surface."""
+    found = model.read(1, window=window_of(window)).astype(np.float64)
+    found[found == NODATA] = np.nan
+    return found

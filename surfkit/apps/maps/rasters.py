@@ -1,0 +1,132 @@
+"""Rasters that are being drawn: a GeoTIFF for each tile that is not empty, and a GDAL virtual raster to join them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from surfkit.apps.maps.grid import Grid, Window
+from surfkit.core.codec import from_json
+from surfkit.core.files import replacing
+
+BLOCK = 512
+"""Side of the tiles within a file, cells."""
+NODATA = -9999.0
+"""Height where there is no surface."""
+Kind = Literal["heights", "colors", "shades"]
+CHANNELS = {"heights": ("Gray",), "colors": ("Red", "Green", "Blue", "Alpha"), "shades": ("Gray",)}
+FACTS = "surfkit"
+"""Tag of a tile for what was counted when it was drawn."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A raster on its way.
+
+    Attributes:
+        folder: Of the tiles; all that are in it are whole.
+        grid: The cells.
+        crs: Coordinate reference system, of rasterio.
+        kind: What it shows.
+        double: Whether heights need 64-bit floats.
+    """
+
+    folder: Path
+    grid: Grid
+    crs: Any
+    kind: Kind
+    double: bool
+
+    @property
+    def dtype(self) -> str:
+        """Of the cells."""
+        return ("float64" if self.double else "float32") if self.kind == "heights" else "uint8"
+
+    @property
+    def nodata(self) -> float | None:
+        """What cells without a surface have; None where a channel says it."""
+        return {"heights": NODATA, "colors": None, "shades": 0}[self.kind]
+
+    def write(self, image: np.ndarray, window: Window, facts: dict[str, Any] | None = None) -> None:
+        """Keep a tile, and what was counted when it was drawn; tiles that are not written are empty.
+
+        Args:
+            image: (C, H, W), or (H, W) for one channel.
+            window: Its place.
+            facts: What JSON has.
+        """
+        from rasterio import Affine
+        from rasterio.io import MemoryFile
+
+        gsd, west, north = self.grid.gsd, self.grid.west + window.left, self.grid.north - window.top
+        place = {"crs": self.crs, "transform": Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd)}
+        image = image.reshape(-1, window.height, window.width).astype(self.dtype, copy=False)
+        inner = {
+            "tiled": True,
+            "blockxsize": BLOCK,
+            "blockysize": BLOCK,
+            "compress": "LZW",
+            "interleave": "band",
+            "nodata": self.nodata,
+        }
+        size = {"count": len(image), "height": window.height, "width": window.width, "dtype": self.dtype}
+        with MemoryFile() as memory:
+            with memory.open(driver="GTiff", **place, **size, **inner) as file:
+                file.write(image)
+                file.update_tags(**{FACTS: json.dumps(facts)})
+            with replacing(self._file(window)) as file:
+                file.write(memory.getbuffer())
+
+    def facts(self, window: Window) -> dict[str, Any] | None:
+        """What was counted when a tile was drawn; None for one that is not there."""
+        import rasterio
+
+        if not self._file(window).exists():
+            return None
+        with rasterio.open(self._file(window)) as file:
+            return from_json(file.tags()[FACTS])
+
+    def whole(self) -> Path:
+        """Write the file that joins the tiles that are there, and return its path."""
+        grid = self.grid
+        west, _, _, north = grid.bounds
+        root = ElementTree.Element("VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
+        ElementTree.SubElement(root, "SRS").text = self.crs.to_wkt()
+        place = west, grid.gsd, 0.0, north, 0.0, -grid.gsd
+        ElementTree.SubElement(root, "GeoTransform").text = ", ".join(map(repr, place))
+        tiles = sorted(self.folder.glob("*.tif"))
+        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte"}[self.dtype]
+        for channel, color in enumerate(CHANNELS[self.kind], 1):
+            band = ElementTree.SubElement(root, "VRTRasterBand", dataType=kind, band=str(channel))
+            if self.nodata is not None:
+                ElementTree.SubElement(band, "NoDataValue").text = repr(self.nodata)
+            ElementTree.SubElement(band, "ColorInterp").text = color
+            for tile in tiles:
+                left, top, width, height = map(int, tile.stem.split("-"))
+                source = ElementTree.SubElement(band, "SimpleSource")
+                ElementTree.SubElement(source, "SourceFilename", relativeToVRT="1").text = tile.name
+                ElementTree.SubElement(source, "SourceBand").text = str(channel)
+                size = {"xSize": str(width), "ySize": str(height)}
+                facts = {"RasterXSize": str(width), "RasterYSize": str(height), "DataType": kind}
+                block = {"BlockXSize": str(BLOCK), "BlockYSize": str(BLOCK)}
+                ElementTree.SubElement(source, "SourceProperties", **facts, **block)
+                ElementTree.SubElement(source, "SrcRect", xOff="0", yOff="0", **size)
+                ElementTree.SubElement(source, "DstRect", xOff=str(left), yOff=str(top), **size)
+        path = self.folder / "whole.vrt"
+        ElementTree.ElementTree(root).write(path)
+        return path
+
+    def _file(self, window: Window) -> Path:
+        return self.folder / f"{window.left}-{window.top}-{window.width}-{window.height}.tif"
+
+
+def window_of(window: Window) -> Any:
+    """The same as rasterio has it."""
+    from rasterio.windows import Window as Their
+
+    return Their(window.left, window.top, window.width, window.height)

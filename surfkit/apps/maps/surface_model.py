@@ -1,0 +1,140 @@
+"""The digital surface model, the highest surface above each cell, and the true orthophoto, the colours of it."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.apps.maps.bins import Bins, corners_of, sort_faces
+from surfkit.apps.maps.geotiff import Sheet
+from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.photographs import FromPhotographs
+from surfkit.apps.maps.rasters import NODATA
+from surfkit.apps.maps.zbuffer import NONE, ZBuffer, barycentric
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.evaluate.geometry.surface import Surface
+
+CELLS = 1 << 20
+"""Cells whose colour is computed at once."""
+GREY = 128
+"""Of what no photograph shows, if the mesh has no colours."""
+COLORS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn.
+
+    Attributes:
+        covered: Cells with a surface.
+        lowest: Height, units of the input.
+        highest: The same.
+        from_photographs: Cells with the colour of a photograph.
+    """
+
+    covered: int
+    lowest: float
+    highest: float
+    from_photographs: int = 0
+
+
+def has_colors(surface: Surface) -> bool:
+    """Whether the vertices of a mesh have colours."""
+    return set(COLORS) <= set(surface.rows.dtype.names or ())
+
+
+def draw_surface(
+    surface: Surface,
+    sheet: Sheet,
+    side: int,
+    heights: str,
+    colors: str | None = None,
+    photographs: FromPhotographs | None = None,
+) -> Drawn:
+    """Write the surface model, and the orthophoto, of a mesh.
+
+    Args:
+        surface: The mesh, in the frame of the input.
+        sheet: Where.
+        side: Cells of a tile, along each side, on which memory depends.
+        heights: File name of the surface model.
+        colors: File name of the orthophoto; None for none.
+        photographs: What has the colours of the cells that photographs show; None for those of the vertices everywhere.
+
+    Raises:
+        BadInput: No cell has a surface.
+    """
+    bins = sort_faces(surface, sheet.grid, side, sheet.folder / f"faces-{Path(heights).stem}")
+    windows, found = list(sheet.grid.tiles(side)), []
+    with ExitStack() as files:
+        model = files.enter_context(sheet.raster(heights, "heights"))
+        photo = None if colors is None else files.enter_context(sheet.raster(colors, "colors"))
+        for tile, window in enumerate(windows):
+            facts = model.facts(window)
+            if facts is None and (buffer := drawn_tile(bins, tile, window)).covered.any():
+                facts = facts_of(buffer)
+                if photo is not None:
+                    image = colors_of(buffer, bins)
+                    facts["from_photographs"] = 0 if photographs is None else photographs.over(tile, buffer, image)
+                    photo.write(image, window)
+                model.write(np.where(buffer.covered, buffer.height, NODATA), window, facts)  # last: the tile is done
+            found += [] if facts is None else [facts]
+            emit(Progress(f"drawing {Path(heights).stem}", tile + 1, len(windows)))
+        if not found:
+            raise BadInput(
+                f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
+                "smaller --gsd, or other --bounds"
+            )
+    return Drawn(
+        sum(facts["covered"] for facts in found),
+        min(facts["lowest"] for facts in found),
+        max(facts["highest"] for facts in found),
+        sum(facts.get("from_photographs", 0) for facts in found),
+    )
+
+
+def drawn_tile(bins: Bins, tile: int, window: Window) -> ZBuffer:
+    """The highest triangles on a tile of the map."""
+    buffer = ZBuffer(window)
+    for numbers in bins.of(tile):
+        buffer.draw(corners_of(bins.surface, bins.grid, numbers), numbers)
+    return buffer
+
+
+def facts_of(buffer: ZBuffer) -> dict[str, Any]:
+    """What is counted of a tile with a surface."""
+    found = buffer.height[buffer.covered]
+    return {"covered": len(found), "lowest": float(found.min()), "highest": float(found.max())}
+
+
+def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
+    """(4, H, W) uint8 colours of the highest triangles at the centres of cells, between those of their corners (grey if
+    they have none), and 255; 0 0 0 0 where there is no triangle."""
+    window, faces = buffer.window, buffer.face.reshape(-1)
+    image, colored = np.zeros((4, faces.size), np.uint8), has_colors(bins.surface)
+    seen = np.flatnonzero(faces != NONE)
+    for at in range(0, len(seen), CELLS):
+        cells = seen[at : at + CELLS]
+        used, owner = np.unique(faces[cells], return_inverse=True)
+        row, column = np.divmod(cells, window.width)
+        places = column + window.left + 0.5, row + window.top + 0.5
+        inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
+        rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
+        for channel, name in enumerate(COLORS):
+            values = rows[name] if colored else np.full(len(rows), GREY)
+            a, b, c = values.reshape(-1, 3).T.astype(np.float64)
+            found = a[owner] + second * (b - a)[owner] + third * (c - a)[owner]
+            image[channel, cells[inside]] = np.rint(found).astype(np.uint8)
+        image[3, cells] = 255
+    return image.reshape(4, *buffer.face.shape)
+
+
+def needs_double(surface: Surface, grid: Grid) -> bool:
+    """Whether heights of a mesh, in 32 bits, would be coarser than a hundredth of a cell."""
+    highest = max((float(np.abs(grid.to_map(block)[:, 2]).max(initial=0)) for block in surface.blocks()), default=0.0)
+    return float(np.spacing(np.float32(highest))) > grid.gsd / 100

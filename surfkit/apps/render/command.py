@@ -1,0 +1,137 @@
+"""`surfkit render`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.apps.render.frames import Show, draw_frames, identity
+from surfkit.apps.render.path import LONGEST, MOST_FRAMES, Flight, flyover, from_file, lens_of, orbit
+from surfkit.apps.render.video import Film, is_video, make_video, require_video
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.lock import locked
+from surfkit.raster.select import Device
+from surfkit.runs.notes import collect_notes
+from surfkit.runs.pipeline import loaded
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import Scene
+from surfkit.train.bars import bars
+from surfkit.train.faults import full_disk_in_one_line
+
+SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+FPS = 30.0
+MADE: dict[str, Callable[[Scene, Camera, int], Flight]] = {"orbit": orbit, "flyover": flyover}
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw a finished run along a path of the camera, as a video or as pictures.
+
+    Example: `surfkit render RUN --path orbit --out orbit.mp4 --seconds 20 --size 1920x1080`. When it is interrupted,
+    the same command goes on where it stopped.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    path: Annotated[str, tyro.conf.arg(metavar="orbit|flyover|FILE")] = "orbit"
+    """orbit: around the middle of the scene. flyover: straight over it, along its longest side. FILE: JSON with cameras
+    to fly through, as RUN/cameras.json, or a camera path of nerfstudio in the frame of the data set."""
+
+    out: Path | None = None
+    """Video file, .mp4 or .webm (needs OpenCV: `pip install 'surfkit[video]'`), or a folder for pictures. Default: a
+    video in the run folder, named after the path."""
+
+    seconds: float = 10.0
+    """Length of the video. A camera path of nerfstudio has its own number of frames."""
+
+    fps: float | None = None
+    """Frames per second. Default: what the file of cameras says, otherwise 30."""
+
+    size: Annotated[str | None, tyro.conf.arg(metavar="WIDTHxHEIGHT")] = None
+    """Size of the pictures, pixels, such as 1920x1080. Default: that of the training photographs."""
+
+    show: Show = "color"
+    """What is drawn."""
+
+    compressed: bool = False
+    """Draw the compressed model of the run (`surfkit compress`)."""
+
+    keep_frames: bool = False
+    """Keep the folder of pictures beside the video, OUT.frames."""
+
+    device: Device = "auto"
+    """Device for rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name (`surfkit components rasterizer`)."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("seconds", self.seconds), ("fps", self.fps)):
+            if value is not None and not 0 < value <= 1e6:
+                raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
+        if self.frames > MOST_FRAMES:
+            raise BadInput(f"--seconds {self.seconds:g}: that is {self.frames} frames; at most {MOST_FRAMES} are drawn")
+        self.sides()
+        if self.path not in MADE and not Path(self.path).is_file():
+            raise BadInput(f"--path {self.path}: no such file; give {', '.join(MADE)} or a JSON file with cameras")
+        if self.out is not None and self.out.suffix and not is_video(self.out):
+            raise BadInput(f"--out {self.out}: give a video, .mp4 or .webm, or a folder for pictures")
+
+    @property
+    def frames(self) -> int:
+        """How many there are, if the path does not say."""
+        return max(1, round(self.seconds * (self.fps or FPS)))
+
+    def sides(self) -> tuple[int, int] | None:
+        """Width and height in pixels; BadInput if `size` is none."""
+        if self.size is None:
+            return None
+        found = SIZE.fullmatch(self.size)
+        sides = tuple(map(int, found.groups())) if found else (0, 0)
+        if not all(16 <= side <= LONGEST for side in sides):
+            raise BadInput(f"--size {self.size}: give width and height such as 1920x1080, of 16 to {LONGEST} pixels")
+        return sides[0], sides[1]
+
+    def run(self) -> None:
+        """Draw the frames, make the video, and print what was written."""
+        name = self.path if self.path in MADE else Path(self.path).stem
+        out = self.out or self.run_folder / f"{name}.mp4"
+        film = is_video(out)
+        if film:
+            require_video()  # before anything is read
+        with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
+            draw = (made.draw_color if self.show == "color" else None) or made.draw
+            if draw is None:
+                raise BadInput(f"{ctx.run.out}: what its method has made draws no pictures")
+            flight = self.flight(ctx.scene)
+            fps = self.fps or flight.fps or FPS
+            model = identity(self.run_folder, self.compressed)
+            if film:
+                make_video(out, Film(flight.cameras, draw, self.show, model, fps), self.keep_frames)
+            else:
+                with locked(out), full_disk_in_one_line(out):
+                    draw_frames(out, flight.cameras, draw, self.show, model)
+        lens, count = flight.cameras[0], len(flight.cameras)
+        print_table(
+            ("render", "value"),
+            [
+                ("path", self.path),
+                ("frames", f"{count}, {count / fps:.1f} s at {fps:g} per second"),
+                ("size", f"{lens.width} x {lens.height}"),
+                ("video" if film else "pictures", str(out)),
+            ],
+        )
+
+    def flight(self, scene: Scene) -> Flight:
+        """The cameras of all frames."""
+        lens = lens_of(scene, self.sides())
+        if self.path in MADE:
+            return MADE[self.path](scene, lens, self.frames)
+        return from_file(Path(self.path), scene.frame, lens, self.frames)
+
+
+COMMAND = Render

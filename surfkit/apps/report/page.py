@@ -1,0 +1,173 @@
+"""From runs to a page: the sections in their order, and the HTML of all of it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from surfkit.apps.report.elements import Cell, Group, Section, Table, pictures
+from surfkit.apps.report.gallery import encode_all
+from surfkit.apps.report.sections.ablation import NAME, read_table, row_runs, table_section
+from surfkit.apps.report.sections.blocks import blocks
+from surfkit.apps.report.sections.compressed import compressed
+from surfkit.apps.report.sections.configuration import configuration
+from surfkit.apps.report.sections.curves import curves
+from surfkit.apps.report.sections.notes import notes
+from surfkit.apps.report.sections.provenance import provenance
+from surfkit.apps.report.sections.resources import resources
+from surfkit.apps.report.sections.results import results
+from surfkit.apps.report.sections.surface import geometry, meshes
+from surfkit.apps.report.sections.views import held_out
+from surfkit.apps.report.source import Source, read_sources
+from surfkit.apps.report.values import NONE
+from surfkit.core.check import BadInput, printable
+from surfkit.core.files import replacing
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+TEMPLATES = Path(__file__).parent / "templates"
+DEFAULT = "report.html"
+"""Name of the file in the folder of the first run, or of the table."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a report shows.
+
+    Attributes:
+        views: Held-out views with pictures.
+        with_pictures: Whether there are pictures at all.
+    """
+
+    views: int = 3
+    with_pictures: bool = True
+
+    def __post_init__(self) -> None:
+        if self.views < 0:
+            raise BadInput(f"--views {self.views}: give 0 or more")
+
+
+@dataclass(frozen=True)
+class Page:
+    """All of a page.
+
+    Attributes:
+        title: Its heading.
+        sections: In their order.
+    """
+
+    title: str
+    sections: tuple[Section, ...]
+
+
+def page_of(folders: Sequence[Path], options: Options) -> Page:
+    """The report of some run folders, or of the folder of an ablation table.
+
+    Raises:
+        BadInput: A folder is neither, a table is named with anything else, or a file is damaged.
+    """
+    for folder in folders:
+        if not (folder / NAME).is_file() and not (folder / "recipe.json").is_file():
+            raise BadInput(
+                f"{folder}: neither a run folder (recipe.json, run.json) nor a table ({NAME}); name one that surfkit "
+                "train or surfkit ablate made"
+            )
+    tables = [folder for folder in folders if (folder / NAME).is_file()]
+    if not tables:
+        runs = read_sources(folders)
+        return Page(", ".join(run.name for run in runs), run_sections(runs, options))
+    if len(folders) > 1:
+        raise BadInput(f"{tables[0]}: a table is reported alone; name this folder only, or run folders only")
+    report = read_table(tables[0])
+    by_row = row_runs(tables[0], report)
+    sections = run_sections(tuple(by_row.values()), options) if by_row else ()
+    shown = tuple(section for section in sections if section.id != "results")
+    return Page(f"table:{report.get('table')}", (table_section(report, by_row), *shown))
+
+
+def run_sections(runs: Sequence[Source], options: Options) -> tuple[Section, ...]:
+    """All sections that the runs have something for."""
+    drawn = options.with_pictures
+    found = (
+        results(runs),
+        notes(runs),
+        held_out(runs, options.views if drawn else 0),
+        meshes(runs, drawn),
+        geometry(runs, drawn),
+        curves(runs),
+        resources(runs),
+        blocks(runs, drawn),
+        compressed(runs),
+        configuration(runs),
+        provenance(runs),
+    )
+    sections = tuple(section for section in found if section is not None)
+    if len(runs) == 1:
+        return sections
+    index = Section("index", "Sections of each run", (index_of(runs, sections),))
+    return (sections[0], index, *sections[1:])
+
+
+def index_of(runs: Sequence[Source], sections: Sequence[Section]) -> Table:
+    """Links to what the sections say of each run."""
+    groups = [element for section in sections for element in section.elements if isinstance(element, Group)]
+    there = {group.id for group in groups}
+    by_run = [section for section in sections if any(run.id(section.id) in there for run in runs)]
+    rows = []
+    for run in runs:
+        links = [(section.title, run.id(section.id)) for section in by_run]
+        cells = [Cell(title, link=address) if address in there else Cell(NONE) for title, address in links]
+        rows.append((Cell(run.name), *cells))
+    head = ("run", *(section.title for section in by_run))
+    return Table("Where the page tells of each run", head, tuple(rows))
+
+
+def html(page: Page) -> str:
+    """The page as one file that loads nothing; a policy in it forbids the network and all scripts but its own.
+
+    Raises:
+        BadInput: The pictures take too much room.
+    """
+    style, script = ((TEMPLATES / name).read_text(encoding="utf-8").strip() for name in ("page.css", "page.js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    shown = encode_all(picture for section in page.sections for picture in pictures(section.elements))
+    template = environment().get_template("page.html.j2")
+    return template.render(page=page, shown=shown, style=style, script=script, script_digest=digest)
+
+
+def environment() -> Environment:
+    """The templates; whatever they print is escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    loader = FileSystemLoader(TEMPLATES)
+    return Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_quoted,
+    )
+
+
+def _quoted(value: Any) -> Any:
+    """What a template prints, without control characters; HTML that it includes stays as it is."""
+    return printable(value, lines=True) if type(value) is str else value
+
+
+def write_report(folders: Sequence[Path], out: Path, options: Options) -> int:
+    """Write the report of some folders, whole or not at all, and return its size in bytes.
+
+    Raises:
+        BadInput: See `page_of` and `html`.
+    """
+    # Names of files that are not UTF-8 become question marks.
+    content = html(page_of(folders, options)).encode("utf-8", "replace")
+    with replacing(out) as file:
+        file.write(content)
+    return len(content)

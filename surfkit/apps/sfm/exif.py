@@ -1,0 +1,239 @@
+"""What a camera or drone wrote into a photograph: lens, time, orientation, position and how exact it is."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from PIL import Image
+
+from surfkit.apps.sfm import xmp as xmp_names
+from surfkit.apps.sfm.xmp import read_xmp
+
+# What is damaged counts as not said.
+warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
+EXIF_IFD, GPS_IFD = 0x8769, 0x8825
+MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
+TAKEN, SUBSECOND, FOCAL_MM, FOCAL35_MM = 0x9003, 0x9291, 0x920A, 0xA405
+BODY, LENS = 0xA431, 0xA435
+"""Serial numbers."""
+PIXELS_X, PER_UNIT_X, UNIT = 0xA002, 0xA20E, 0xA210
+LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, ERROR_M = 1, 2, 3, 4, 5, 6, 31
+UNIT_MM = {2: 25.4, 3: 10.0}
+"""Of the focal plane's resolution: inch, centimetre."""
+DIAGONAL35_MM = math.hypot(36, 24)
+"""Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
+LIKELY = (0.1, 10.0)
+"""Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
+MOST_ERROR_M = 1e4
+"""An accuracy beyond it is no accuracy."""
+ABOVE, BELOW = (0, 2), (1, 3)
+"""References of altitudes, see `_zero`."""
+SEA_LEVEL = (2, 3)
+VERSION = 36864
+"""Tag of the version of EXIF: 0232, 0300."""
+RTK_FLAG = "RtkFlag"
+"""In XMP of DJI: 0 without RTK; 16, 34 or 50 where the position is of that receiver."""
+Zero = Literal["sea level", "ellipsoid"]
+
+Position = tuple[float, float, float | None]
+"""Latitude and longitude, degrees on WGS 84, and altitude, metres; None where it is not known."""
+
+
+@dataclass(frozen=True)
+class Exif:
+    """Facts of a photograph; None where it does not say.
+
+    Attributes:
+        camera: Make and model.
+        serial: Serial numbers of body and lens, and the number in a rig: which one of several equal cameras it is.
+        taken: Time, "2024:05:01 12:00:00.25", which sorts by time.
+        orientation: 1 to 8, as EXIF numbers them; 1 is upright.
+        focal_px: Focal length in pixels of the longer side's direction, at the size of the file.
+        position: Where it was taken, in EXIF; the altitude is as the file gives it.
+        unsigned: Which of latitude and longitude have no letter of the hemisphere, so that their sign is not known; the
+            position has them as positive.
+        no_reference: Whether nothing says if the altitude is above or below its zero; it is taken as above.
+        zero: What the altitude is counted from, by EXIF and XMP; None without one, or where it is from elsewhere.
+        xmp_position: Where it was taken, in XMP.
+        xmp_altitude: Altitude in XMP, metres, also where XMP has no position.
+        above_start: Height above the place of the start in XMP, metres.
+        accuracy_m: Standard deviations east, north and up, metres, of a receiver that states them (RTK).
+    """
+
+    camera: str | None = None
+    taken: str | None = None
+    serial: str | None = None
+    orientation: int = 1
+    focal_px: float | None = None
+    position: Position | None = None
+    unsigned: tuple[str, ...] = ()
+    no_reference: bool = False
+    zero: Zero | None = None
+    xmp_position: Position | None = None
+    xmp_altitude: float | None = None
+    above_start: float | None = None
+    accuracy_m: tuple[float, float, float] | None = None
+
+    @property
+    def which(self) -> str | None:
+        """Make and model, and which of several equal cameras it is."""
+        return self.camera if self.serial is None else f"{self.camera} {self.serial}"
+
+
+def read_exif(image: Image.Image, size: tuple[int, int]) -> Exif:
+    """What an open picture says of itself; what is damaged in it counts as not said.
+
+    Args:
+        image: Of Pillow; its pixels are not decoded.
+        size: Width and height of the file.
+    """
+    try:
+        tags = image.getexif()
+        basic, camera, gps = dict(tags), dict(tags.get_ifd(EXIF_IFD)), dict(tags.get_ifd(GPS_IFD))
+    except Exception:  # Pillow raises whatever the bytes of a damaged block lead to
+        basic, camera, gps = {}, {}, {}
+    return facts(basic, camera, gps, read_xmp(image.info.get("xmp")), size)
+
+
+def facts(
+    basic: Mapping[int, Any],
+    camera: Mapping[int, Any],
+    gps: Mapping[int, Any],
+    xmp: Mapping[str, float],
+    size: tuple[int, int],
+) -> Exif:
+    """The facts in the tags of the three parts of EXIF and in the numbers of XMP."""
+    names = [_text(basic.get(tag)) for tag in (MAKE, MODEL)]
+    taken = _text(camera.get(TAKEN))
+    part = _text(camera.get(SUBSECOND))
+    turned = basic.get(ORIENTATION, 1)
+    position, unsigned = _position(gps)
+    return Exif(
+        camera=" ".join(filter(None, names)) or None,
+        serial=_serial(camera, xmp),
+        taken=f"{taken}.{part}" if taken and part else taken,
+        orientation=int(turned) if turned in range(1, 9) else 1,
+        focal_px=_focal_px(camera, size),
+        position=position,
+        unsigned=unsigned,
+        no_reference=position is not None and position[2] is not None and _reference(gps) is None,
+        zero=_zero(gps, camera, xmp),
+        xmp_position=_xmp_position(xmp),
+        xmp_altitude=xmp.get(xmp_names.ALTITUDE),
+        above_start=xmp.get(xmp_names.ABOVE_START),
+        accuracy_m=_accuracy(gps, xmp),
+    )
+
+
+def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
+    found = [*(_text(tags.get(tag)) for tag in (BODY, LENS)), xmp.get("RigCameraIndex")]
+    return " ".join(str(part) for part in found if part is not None) or None
+
+
+def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
+    focal, equivalent = _number(tags.get(FOCAL_MM)), _number(tags.get(FOCAL35_MM))
+    if equivalent and _is_likely(found := equivalent / DIAGONAL35_MM * math.hypot(*size), size):
+        return found
+    density, unit = _number(tags.get(PER_UNIT_X)), UNIT_MM.get(tags.get(UNIT, 2))
+    width = _number(tags.get(PIXELS_X))
+    if not (focal and density and unit and width):
+        return None
+    sensor_mm = width / density * unit  # of the direction that was the width when the photograph was taken
+    found = focal / sensor_mm * max(size)
+    return found if _is_likely(found, size) else None
+
+
+def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:
+    return LIKELY[0] < focal_px / max(size) < LIKELY[1]
+
+
+def _position(tags: Mapping[int, Any]) -> tuple[Position | None, tuple[str, ...]]:
+    """The position, and which of latitude and longitude have no sign."""
+    latitude, north = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "N", "S", 90)
+    longitude, east = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "E", "W", 180)
+    if latitude is None or longitude is None or (latitude, longitude) == (0, 0):  # a receiver without a fix
+        return None, ()
+    altitude = _number(tags.get(ALTITUDE), negative=True)
+    if altitude is not None and _reference(tags) in BELOW:
+        altitude = -abs(altitude)
+    unsigned = tuple(name for name, known in (("latitude", north), ("longitude", east)) if not known)
+    return (latitude, longitude, altitude), unsigned
+
+
+def _degrees(value: Any, letter: Any, positive: str, negative: str, most: float) -> tuple[float | None, bool]:
+    """Degrees, and whether their sign is known: by the letter, or as they are below 0. They are degrees, minutes and
+    seconds, or fewer of these."""
+    try:
+        parts = [float(part) for part in (value if isinstance(value, (tuple, list)) else (value,))]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None, False
+    if not 1 <= len(parts) <= 3:
+        return None, False
+    found = sum(abs(part) / 60**at for at, part in enumerate(parts))
+    if not (math.isfinite(found) and found <= most):
+        return None, False
+    half, below = (_text(letter) or "")[:1].upper(), parts[0] < 0
+    if half == negative or (below and half != positive):
+        return -found, True
+    return found, half == positive and not below
+
+
+def _reference(tags: Mapping[int, Any]) -> int | None:
+    """What the altitude is counted from; None where that is not said."""
+    value = tags.get(ALTITUDE_REF)
+    try:
+        found = value[0] if isinstance(value, bytes) else int(value)
+    except (TypeError, ValueError, IndexError):
+        return None
+    return found if found in (*ABOVE, *BELOW) else None
+
+
+def _zero(gps: Mapping[int, Any], camera: Mapping[int, Any], xmp: Mapping[str, float]) -> Zero | None:
+    """What altitudes are counted from.
+
+    References 2 and 3 are the sea level. 0 and 1 were it until EXIF 3.0, which made them the ellipsoid. Drones with RTK
+    write heights above the ellipsoid under the old 0, as there was no other.
+    """
+    if ALTITUDE not in gps and xmp_names.ALTITUDE not in xmp:
+        return None
+    reference = _reference(gps)
+    if reference in SEA_LEVEL:
+        return "sea level"
+    is_new = reference is not None and (_text(camera.get(VERSION)) or "") >= "0300"
+    return "ellipsoid" if is_new or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
+
+
+def _xmp_position(xmp: Mapping[str, float]) -> Position | None:
+    latitude, longitude = xmp.get(xmp_names.LATITUDE), xmp.get(xmp_names.LONGITUDE)
+    if latitude is None or longitude is None or (latitude, longitude) == (0, 0):
+        return None
+    return latitude, longitude, xmp.get(xmp_names.ALTITUDE)
+
+
+def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
+    rtk = tuple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
+    across, up = xmp.get("GPSXYAccuracy", 0.0), xmp.get("GPSZAccuracy", 0.0)
+    stated = _number(gps.get(ERROR_M)) or 0.0
+    for found in (rtk, (across, across, up), (stated, stated, 2 * stated)):  # heights are half as exact by GPS
+        if all(0 < value < MOST_ERROR_M for value in found):
+            return found  # type: ignore[return-value]
+    return None
+
+
+def _number(value: Any, negative: bool = False) -> float | None:
+    """A finite number, or None; 0 and less count only if `negative`."""
+    try:
+        found = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return found if math.isfinite(found) and (negative or found > 0) else None
+
+
+def _text(value: Any) -> str | None:
+    if isinstance(value, bytes):
+        value = value.decode("ascii", "replace")
+    return value.strip("\0 ") or None if isinstance(value, str) else None

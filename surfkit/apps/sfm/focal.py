@@ -1,0 +1,268 @@
+"""What EXIF says of the focal length, as strong as that is: nadir photographs alone cannot tell it from the height.
+
+Seen straight down, a scene twice as high through a lens twice as long gives the same pictures. So bundle adjustment
+takes the focal length of EXIF for a measurement with a standard deviation: photographs that look in several directions
+outweigh it, others do not.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surfkit.apps.sfm.engine import load_engine
+from surfkit.apps.sfm.photographs import Photo
+
+SIGMA = 0.03
+"""Standard deviation of the focal length of EXIF, as a share: it is rounded, and lenses differ by some percent."""
+SIGMA_ALONE = 0.1
+"""That of the focal length by photographs alone, where EXIF has none and positions are weighed against it."""
+SIGMAS = 3.0
+"""From so many standard deviations on, two sources contradict each other."""
+MARKS = 64
+"""Observations that stand for the focal length of EXIF: many near the axis, where no distortion bends them."""
+LEVEL = 0.02
+"""Cameras whose heights, less a plane, spread by less than this share of their height above the ground say nothing of
+the focal length: bundle adjustment bends a model by up to a tenth of it."""
+SAMPLE = 100
+"""Cameras that tell how far away the ground is."""
+PARALLEL = 0.06
+"""Root mean square of the sines between the axes of photographs, below which all look the same way."""
+
+
+@dataclass(frozen=True)
+class Focal:
+    """The focal length of a lens from three sources, pixels, the mean of both axes.
+
+    Attributes:
+        exif: In EXIF; None where it has none.
+        alone: By the photographs alone.
+        final: By photographs, EXIF and positions together.
+        photographs: That were taken with it.
+    """
+
+    exif: float | None
+    alone: float
+    final: float
+    photographs: int
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the photographs say, beyond doubt, something else than EXIF.
+
+        The weighted mean of two measurements moves away from the first by (alone - exif) s^2 / (s^2 + t^2), with s and
+        t their standard deviations. So the product below is (alone - exif)^2 / (s^2 + t^2), without knowing t.
+        """
+        if self.exif is None:
+            return False
+        alone, final = self.alone / self.exif - 1, self.final / self.exif - 1
+        return alone * final > (SIGMAS * SIGMA) ** 2 or abs(final) > SIGMAS * SIGMA
+
+    @property
+    def drifts(self) -> bool:
+        """Whether, without EXIF, positions draw it so far that the photographs cannot know it."""
+        return self.exif is None and abs(self.final / self.alone - 1) > SIGMAS * SIGMA
+
+
+def exif_focals(model: Any, photos: Mapping[str, Photo]) -> dict[int, float]:
+    """The focal length in EXIF of each placed camera of a pycolmap.Reconstruction, pixels, by its number."""
+    found = {}
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        if (focal := photos[image.name].exif.focal_px) is not None:
+            found.setdefault(image.camera_id, focal)
+    return found
+
+
+def known_focals(model: Any, photos: Mapping[str, Photo], alone: bool) -> dict[int, tuple[float, float]]:
+    """What is known of the focal length of cameras: pixels, and the standard deviation as a share, by number.
+
+    Args:
+        model: pycolmap.Reconstruction.
+        photos: By name.
+        alone: Whether that of the model is taken where EXIF has none.
+    """
+    own = {number: (camera.mean_focal_length(), SIGMA_ALONE) for number, camera in model.cameras.items() if alone}
+    return own | {number: (focal, SIGMA) for number, focal in exif_focals(model, photos).items()}
+
+
+def add_marks(model: Any, config: Any, focals: Mapping[int, tuple[float, float]]) -> None:
+    """Add to a reconstruction, and to what is adjusted, observations that stand for known focal lengths.
+
+    For each lens this is an image and points that do not move, at a small angle t from its axis, with the place in the
+    image that the focal length f of EXIF gives them. Their residuals are (focal length - f) t pixels; t is such that
+    all of a lens together weigh as one measurement of f with its standard deviation, as pixels have one of 1.
+    """
+    engine = load_engine()
+    images = [model.image(number) for number in model.reg_image_ids()]
+    number = max(model.images) + 1
+    for camera_id, (focal, sigma) in sorted(focals.items()):
+        camera = model.cameras[camera_id]
+        one = next((image for image in images if image.camera_id == camera_id), None)
+        if one is None:
+            continue
+        pose, depth = one.cam_from_world(), max(_depth(model, one), 1e-9)
+        axes = np.eye(2)[: len(camera.focal_length_idxs())]  # one focal length stands for both
+        t = 1 / (sigma * focal * np.sqrt(MARKS))
+        rays = np.repeat(axes * t, MARKS // 2 // len(axes), 0)
+        pixels = np.repeat(rays, 2, 0) * focal + (camera.principal_point_x, camera.principal_point_y)
+        image = engine.Image(name=f"focal length {camera_id}", keypoints=pixels, camera_id=camera_id, image_id=number)
+        frame = engine.Frame(rig_id=one.frame.rig_id, frame_id=max(model.frames) + 1)
+        frame.add_data_id(image.data_id)
+        frame.rig_from_world = pose
+        model.add_frame(frame)
+        image.frame_id = frame.frame_id
+        model.add_image(image)
+        model.register_frame(frame.frame_id)
+        places = np.column_stack([rays, np.ones(len(rays))]) * depth
+        for at, xyz in enumerate(pose.inverse() * places):
+            track = engine.Track()
+            for mark in (2 * at, 2 * at + 1):  # bundle adjustment wants two of each point
+                track.add_element(number, mark)
+            config.add_constant_point(model.add_point3D(xyz, track, np.zeros(3, np.uint8)))
+        config.add_image(number)
+        config.set_constant_rig_from_world_pose(frame.frame_id)
+        number += 1
+
+
+def _depth(model: Any, image: Any) -> float:
+    """Median depth of the points that a photograph shows."""
+    xyz = np.array([model.points3D[spot.point3D_id].xyz for spot in image.get_observation_points2D()]).reshape(-1, 3)
+    return float(np.median((image.cam_from_world() * xyz)[:, 2])) if len(xyz) else 1.0
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What became of focal lengths and heights when EXIF and positions were weighed against the photographs.
+
+    Attributes:
+        focals: Of each lens, that of most photographs first.
+        heights: How many times as high the cameras are above the ground as by the photographs alone.
+        parallel: Whether all photographs look the same way.
+        stretch: How many times as much the heights of the positions differ as those of the cameras, and the standard
+            deviation of that number; None without positions, or where these cannot tell.
+    """
+
+    focals: tuple[Focal, ...]
+    heights: float
+    parallel: bool
+    stretch: tuple[float, float] | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """For the report."""
+        return {
+            "focal_lengths_px": [
+                {"exif": f.exif, "photographs_alone": f.alone, "final": f.final, "photographs": f.photographs}
+                for f in self.focals
+            ],
+            "heights_times": round(self.heights, 3),
+            "gps_heights_times": None if self.stretch is None else [round(value, 3) for value in self.stretch],
+        }
+
+    def doubts(self) -> list[str]:
+        """What contradicts each other, or is known from one source only, a line for each."""
+        found = []
+        for focal in self.focals:
+            if focal.drifts:
+                found.append(
+                    f"EXIF of {focal.photographs} photographs has no focal length; the positions move that by the "
+                    f"photographs alone from {focal.alone:.0f} to {focal.final:.0f} px, and heights above the ground "
+                    f"{self.heights:.2f} times: write the focal length into EXIF, add oblique photographs, or check "
+                    "heights with --gcp"
+                )
+            if focal.contradicts:
+                found.append(
+                    f"the focal length in EXIF of {focal.photographs} photographs is {focal.exif:.0f} px, that by the "
+                    f"photographs alone {focal.alone:.0f} px ({focal.alone / focal.exif - 1:+.0%}; EXIF is taken to be "
+                    f"within {SIGMAS * SIGMA:.0%}); {focal.final:.0f} px are used. If photographs were cropped or EXIF "
+                    "is wrong, remove the focal length from EXIF; otherwise try --lens OPENCV"
+                )
+        if self.stretch is not None and self.contradicts:
+            found.append(
+                f"heights by GPS differ {self.stretch[0]:.3g} +- {self.stretch[1]:.1g} times as much as those of the "
+                "cameras that were found: the focal length is wrong, and heights of the ground with it, or the "
+                "altitudes are; check the focal length in EXIF, add oblique photographs, or give --gcp"
+            )
+        if self.parallel and not self.knows_heights and not any(focal.contradicts for focal in self.focals):
+            has = self.focals[0].exif is not None
+            by = f"known from EXIF only, to {SIGMA:.0%}" if has else "a guess, as EXIF has none"
+            found.append(
+                f"all photographs look the same way, so that they do not tell the focal length: it is {by}, and "
+                "heights above the ground are as exact as it is; add oblique photographs, or check heights with --gcp"
+            )
+        return found
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether heights by GPS contradict those of the cameras, by more than chance and by more than matters."""
+        return self.stretch is not None and abs(self.stretch[0] - 1) > max(SIGMAS * self.stretch[1], SIGMA)
+
+    @property
+    def knows_heights(self) -> bool:
+        """Whether the heights of positions tell the focal length as well as EXIF does."""
+        return self.stretch is not None and self.stretch[1] < SIGMA
+
+
+def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[float, float] | None) -> Weighed:
+    """What became of a model.
+
+    Args:
+        alone: pycolmap.Reconstruction by the photographs alone.
+        final: The same in the end.
+        photos: By name.
+        stretch: As `height_stretch` gives it.
+    """
+    counts = Counter(final.image(number).camera_id for number in final.reg_image_ids())
+    known = exif_focals(final, photos)
+    focals = [
+        Focal(known.get(number), *(model.cameras[number].mean_focal_length() for model in (alone, final)), count)
+        for number, count in counts.most_common()
+    ]
+    heights = _relative_height(final) / max(_relative_height(alone), 1e-9)
+    axes = np.stack([final.image(number).cam_from_world().matrix()[2, :3] for number in final.reg_image_ids()])
+    middle = axes.mean(0)
+    sines = np.linalg.norm(np.cross(axes, middle / max(np.linalg.norm(middle), 1e-9)), axis=1)
+    return Weighed(tuple(focals), heights, bool(np.sqrt((sines**2).mean()) < PARALLEL), stretch)
+
+
+def height_stretch(
+    placed: np.ndarray, onto: np.ndarray, sigma: np.ndarray, ground: float
+) -> tuple[float, float] | None:
+    """How many times as much the heights of positions differ as those of cameras, and the standard deviation of that
+    number; None where all heights are as good as equal.
+
+    A model with a wrong focal length is too high or too low. That shows in the heights of its cameras, unless these
+    follow a plane, which a turn of the model takes for level.
+
+    Args:
+        placed: (P, 3) of the cameras, on the map.
+        onto: (P, 3) of their positions.
+        sigma: (P,) standard deviations of their heights.
+        ground: Median height of the cameras above it.
+    """
+    plane = np.column_stack([np.ones(len(placed)), placed[:, :2] - placed[:, :2].mean(0)]) / sigma[:, None]
+    both = np.column_stack([placed[:, 2], onto[:, 2]]) / sigma[:, None]
+    ours, theirs = (both - plane @ np.linalg.lstsq(plane, both, rcond=None)[0]).T
+    spread = np.sqrt((ours**2).sum() / (1 / sigma**2).sum())
+    if len(placed) <= plane.shape[1] + 1 or not spread > LEVEL * ground:
+        return None
+    return float(ours @ theirs / (ours @ ours)), float(1 / np.sqrt(ours @ ours))
+
+
+def height_above_ground(model: Any) -> float:
+    """Median distance of the ground from the cameras, by some of them that are spread over all."""
+    numbers = sorted(model.reg_image_ids())
+    some = numbers[:: -(-len(numbers) // SAMPLE)]
+    return float(np.median([_depth(model, model.image(number)) for number in some]))
+
+
+def _relative_height(model: Any) -> float:
+    """The same, as a share of how far the cameras are apart."""
+    images = [model.image(number) for number in model.reg_image_ids()]
+    centres = np.stack([image.projection_center() for image in images])
+    apart = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+    return height_above_ground(model) / max(apart, 1e-9)

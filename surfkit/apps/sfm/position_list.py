@@ -1,0 +1,259 @@
+"""Positions of photographs from a file: geo.txt of OpenDroneMap, or a table such as Metashape and Pix4D write."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.apps.sfm.exif import MOST_ERROR_M, Position
+from surfkit.core.check import BadInput, few
+from surfkit.core.events import Warned, emit
+from surfkit.io.datasets.systems import WGS84_DEGREES, System, names_a_system, system_of
+
+COLUMNS = {
+    "name": "name label image imagename imagefile photo photograph photoname file filename sourcefile camera "
+    "cameraname picture",
+    "x": "x xlongitude xeast xeasting easting east e longitude lon long lng gpslongitude geox",
+    "y": "y ylatitude ynorth ynorthing northing north n latitude lat gpslatitude geoy",
+    "z": "z zaltitude zheight altitude alt height elevation elev h up gpsaltitude ellipsoidalheight geoz",
+    "crs": "crs epsg srs coordinatesystem projection",
+    "sx": "sx sigmax stdx sde sdeast stdeast xaccuracy accuracyx xacc sdlon stdlon",
+    "sy": "sy sigmay stdy sdn sdnorth stdnorth yaccuracy accuracyy yacc sdlat stdlat",
+    "sxy": "sxy sigmaxy accuracyhorz horzaccuracy horizontalaccuracy accuracyhorizontal hacc xyaccuracy accuracyxy "
+    "gpsxyaccuracy",
+    "sz": "sz sigmaz stdz sdu sdup stdup zaccuracy accuracyz zacc accuracyvert vertaccuracy verticalaccuracy "
+    "accuracyvertical vacc gpszaccuracy sdheight stdheight",
+}
+"""Names of the columns that are used, in small letters without blanks, units and marks."""
+MEANINGS = {name: column for column, names in COLUMNS.items() for name in names.split()}
+PLAIN = ("name", "x", "y", "z", "yaw", "pitch", "roll", "sxy", "sz")
+"""Columns of geo.txt, and of a table without a header."""
+DEGREES = {"longitude", "lon", "long", "lng", "gpslongitude"}
+"""Names of x that say degrees."""
+COMMENT = re.compile(r"#\s*(?:CoordinateSystem\s*:\s*)?(.*)", re.IGNORECASE)
+"""A line that Metashape or a person begins with #; it may name the system, or the columns."""
+MARKS = "\t;,"
+"""What may stand between cells; blanks otherwise."""
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
+WANTED = "name, x (east or longitude), y (north or latitude) and z, such as `DJI_0001.JPG,372345.1,5846123.4,120.5`"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the file.
+
+    Attributes:
+        at: Number of the line, from 1.
+        cells: By column.
+    """
+
+    at: int
+    cells: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Positions that a file gives.
+
+    Attributes:
+        positions: By the name of the photograph, as the file has it.
+        accuracies: Standard deviations east, north and up, metres, of those for which it gives them.
+        systems: Of its coordinates.
+    """
+
+    positions: Mapping[str, Position]
+    accuracies: Mapping[str, tuple[float, float, float]]
+    systems: Sequence[System]
+
+    @property
+    def crs(self) -> str | None:
+        """The map that its coordinates are on; None if they are in degrees or on several."""
+        return self.systems[0].crs if len(self.systems) == 1 and not self.systems[0].degrees else None
+
+    @property
+    def named(self) -> str:
+        """Its systems, for messages."""
+        return " and ".join(system.crs if len(system.crs) <= 60 else f"{system.crs[:60]}..." for system in self.systems)
+
+
+def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
+    """The positions in a file.
+
+    Args:
+        path: The file.
+        said: What messages call it.
+        crs: Its coordinate reference system, if it names none.
+
+    Raises:
+        BadInput: It cannot be read; says which line.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError as error:
+        raise BadInput(f"{said}: no such file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"{said}: cannot be read as text of UTF-8") from error
+    named, rows, degrees = _rows(lines, said)
+    own = named or next((row.cells["crs"] for row in rows if row.cells.get("crs")), None)
+    if own is not None and crs is not None:
+        raise BadInput(f"{said}: it names its system itself, {own[:60]!r}; leave --positions-crs out")
+    given = crs if crs is not None else named
+    if given is None and degrees:
+        given = WGS84_DEGREES
+    found: dict[str, tuple[Row, System, list[float | None]]] = {}
+    systems: dict[str, System] = {}
+    for row in rows:
+        text = row.cells.get("crs") or given
+        if text is None:
+            raise BadInput(
+                f"{said}: it names no coordinate reference system; write one into its first line, such as EPSG:32633, "
+                "or name one with --positions-crs"
+            )
+        if text not in systems:
+            where = f"{said}: line {row.at}" if row.cells.get("crs") else said if crs is None else "--positions-crs"
+            systems[text] = _system(f"EPSG:{text}" if text.isdigit() else text, where)
+        numbers = [_number(row.cells.get(axis), said, row, axis == "z") for axis in "xyz"]
+        name = row.cells["name"]
+        if name in found and found[name][2] != numbers:
+            raise BadInput(f"{said}: lines {found[name][0].at} and {row.at} give two positions for {name!r}; keep one")
+        found[name] = (row, systems[text], numbers)
+    if not found:
+        raise BadInput(f"{said}: no positions; each line is {WANTED}")
+    positions = _positions(found, said)
+    accuracies = {name: sigma for name in positions if (sigma := _accuracy(found[name][0], said)) is not None}
+    return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
+
+
+def _system(text: str, where: str) -> System:
+    try:
+        return system_of(text)
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from error
+
+
+def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]:
+    """The system that a line before the positions names, the rows, and whether names of columns say degrees."""
+    system, header, rows, degrees = None, None, [], False
+    for at, line in enumerate(lines, 1):
+        text = line.strip()
+        comment = COMMENT.fullmatch(text)
+        plain = comment[1] if comment else text
+        if not plain:
+            continue
+        if not rows and system is None and names_a_system(plain):
+            system = plain
+            continue
+        if not rows and header is None and (columns := _header(plain)) is not None:
+            header, degrees = columns, any(_small(cell) in DEGREES for cell in _split(plain))
+            continue
+        if comment:
+            continue
+        cells = _split(text) if header is not None else _joined(_split(text))
+        first = not rows and system is None and header is None
+        if first and not any(mark in text for mark in MARKS) and not (len(cells) > 2 and _is_number(cells[1])):
+            system = text  # by a name that pyproj may know
+            continue
+        row = Row(at, dict(zip(header or _plain(cells), (cell.strip() for cell in cells), strict=False)))
+        if header is not None and not (row.cells.get("x") or row.cells.get("y")):
+            continue  # a photograph without a position, as Metashape lists them
+        if not row.cells.get("name"):
+            raise BadInput(f"{said}: line {at} is {text[:60]!r}, not {WANTED}")
+        rows.append(row)
+    return system, rows, degrees
+
+
+def _plain(cells: Sequence[str]) -> list[str]:
+    """The meaning of each cell of a line without names of columns; the last may be a system."""
+    named = len(cells) > 3 and names_a_system(cells[-1])
+    return [*PLAIN[: len(cells) - named], *["crs"] * named]
+
+
+def _header(text: str) -> list[str] | None:
+    """The meaning of each column, "" for one that is not used; None where the line has no names of columns."""
+    found: list[str] = []
+    for cell in _split(text):
+        column = MEANINGS.get(_small(cell), "")
+        found.append("" if column in found else column)
+    return found if {"name", "x", "y"} <= set(found) else None
+
+
+def _small(cell: str) -> str:
+    """The name of a column without what does not matter: `X [m]` and `x_(m)` are x."""
+    return re.sub(r"[\[(][^\])]*[\])]|[^a-z]", "", cell.lower())
+
+
+def _split(text: str) -> list[str]:
+    """The cells of a line."""
+    mark = next((mark for mark in MARKS if text.count(mark) >= 2), None)
+    if mark is None:
+        return text.split()
+    cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
+    return cells if mark == "," else [_with_point(cell.strip()) for cell in cells]
+
+
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell
+
+
+def _joined(cells: Sequence[str]) -> list[str]:
+    """The cells of a line without names of columns, where blanks in the name of the photograph may have cut it."""
+    at = next((at for at in range(1, len(cells) - 1) if _is_number(cells[at]) and _is_number(cells[at + 1])), 1)
+    return [" ".join(cells[:at]), *cells[at:]]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(text: str | None, said: str, row: Row, optional: bool = False) -> float | None:
+    """A finite number; None for one that may be missing, and is."""
+    if optional and (text or "").lower() in ("", "-", "nan", "none", "null"):
+        return None
+    try:
+        found = float(text or "")
+    except ValueError:
+        found = float("nan")
+    if not np.isfinite(found):
+        shown = " ".join(row.cells.values())
+        raise BadInput(f"{said}: line {row.at} is {shown[:60]!r}, not {WANTED}")
+    return found
+
+
+def _positions(found: Mapping[str, tuple[Row, System, list[float | None]]], said: str) -> dict[str, Position]:
+    """Latitudes, longitudes and altitudes, all of a system at once."""
+    positions: dict[str, Position] = {}
+    for system in {system for _, system, _ in found.values()}:
+        names = [name for name, (_, other, _) in found.items() if other == system]
+        xyz = np.array([found[name][2] for name in names], np.float64)
+        wrong = [name for name, (x, y, _) in zip(names, xyz, strict=True) if abs(x) > 180 or abs(y) > 90]
+        if system.degrees and wrong:
+            raise BadInput(
+                f"{said}: {few(wrong)} is not in degrees, as {system.crs} says; x is the longitude and y the latitude"
+            )
+        rows = system.positions(xyz)
+        good = np.isfinite(rows[:, :2]).all(1) & rows[:, :2].any(1)
+        if not good.any():
+            raise BadInput(f"{said}: all positions are where {system.crs} does not reach; x is east and y north")
+        if lost := [name for name, reached in zip(names, good, strict=True) if not reached]:
+            emit(Warned(f"{said}: {len(lost)} positions are no place in {system.crs}, and are left out: {few(lost)}"))
+        for name, (latitude, longitude, height), reached in zip(names, rows.tolist(), good, strict=True):
+            if reached:
+                positions[name] = (latitude, longitude, height if np.isfinite(height) else None)
+    return positions
+
+
+def _accuracy(row: Row, said: str) -> tuple[float, float, float] | None:
+    """Standard deviations, if the row gives them across and up."""
+    across = row.cells.get("sxy")
+    texts = [row.cells.get("sx") or across, row.cells.get("sy") or across, row.cells.get("sz")]
+    found = tuple(_number(text, said, row) or 0.0 for text in texts if text and _is_number(text))
+    return found if len(found) == 3 and all(0 < value < MOST_ERROR_M for value in found) else None

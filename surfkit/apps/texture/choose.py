@@ -1,0 +1,119 @@
+"""One photograph for each triangle: a good one, and the same as its neighbours have.
+
+An energy of a graph of triangles, as in Lempitsky and Ivanov, Seamless Mosaicing of Image-Based Texture Maps (CVPR
+2007): a triangle costs what its photograph lacks in quality, and an edge between two photographs costs a constant. It
+is lowered by min-sum belief propagation (Felzenszwalb and Huttenlocher, Efficient Belief Propagation for Early Vision,
+IJCV 2006), which messages of 20 rounds make a local search; then connected triangles with the same photograph take
+that of a neighbour together, where this lowers it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from surfkit.apps.texture.candidates import NONE, Candidates
+from surfkit.apps.texture.topology import NONE as NO_FACE
+from surfkit.core.events import Progress, emit
+
+SEAM = 2.0
+"""Cost of an edge between two photographs; that of a triangle is the share of the best quality that it lacks."""
+ROUNDS = 20
+"""Of messages between neighbours."""
+DAMPING = 0.5
+"""Share of a message that stays as it was."""
+CHANGES = 16
+"""Rounds of changes of connected triangles, each of about half of them: neighbours must not change together."""
+LARGE = 1e3
+"""Cost of a photograph that does not show the triangle."""
+PART = 1 << 17
+"""Triangles at once."""
+
+
+def choose_views(found: Candidates, beyond: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """(F,) int32 number of the photograph of each triangle; NONE where none shows it.
+
+    Args:
+        found: What can be chosen.
+        beyond: (F, 3) triangles beyond the edges, see `neighbours`.
+        edge: (F, 3) edges of theirs.
+    """
+    best = found.quality.max(1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cost = np.where(found.view != NONE, 1 - found.quality / best, LARGE).astype(np.float32)
+    message = np.zeros((*beyond.shape, found.view.shape[1]), np.float32)
+    for turn in range(ROUNDS):
+        total = cost + message.sum(1)
+        after = np.empty_like(message)
+        for at in range(0, len(cost), PART):
+            part = slice(at, at + PART)
+            for side in range(3):
+                after[part, side] = _messages(found.view, total, message, beyond, edge, part, side)
+        message *= DAMPING  # in place: it is the largest array of all
+        after *= 1 - DAMPING
+        message += after
+        emit(Progress("choosing photographs", turn + 1, ROUNDS))
+    slot = (cost + message.sum(1)).argmin(1)
+    chosen = np.where(found.view.max(1) == NONE, NONE, found.view[np.arange(len(slot)), slot]).astype(np.int32)
+    draw = np.random.default_rng(0)
+    for _ in range(CHANGES):
+        chosen = _changed(chosen, found.view, cost, beyond, draw)
+    return chosen
+
+
+def _messages(
+    view: np.ndarray,
+    total: np.ndarray,
+    message: np.ndarray,
+    beyond: np.ndarray,
+    edge: np.ndarray,
+    part: slice,
+    side: int,
+) -> np.ndarray:
+    """(n, K) what the triangles beyond one edge of some triangles say to the photographs of these."""
+    there = beyond[part, side]
+    # what the neighbour would cost with each of its photographs, without what it was told from here
+    theirs = total[there] - message[there, edge[part, side]]
+    least = theirs.min(1, keepdims=True)
+    found = np.broadcast_to(least + np.float32(SEAM), theirs.shape).copy()
+    for slot in range(view.shape[1]):
+        same = (view[part] == view[there, slot][:, None]) & (view[part] != NONE)
+        found = np.where(same, np.minimum(found, theirs[:, slot, None]), found)
+    found -= least
+    found[(there == NO_FACE) | (view[there].max(1) == NONE)] = 0
+    return found
+
+
+def _changed(
+    chosen: np.ndarray, view: np.ndarray, cost: np.ndarray, beyond: np.ndarray, draw: np.random.Generator
+) -> np.ndarray:
+    """The same after connected triangles took the photograph of a neighbour, where that lowers the energy most."""
+    face, edge = np.nonzero((beyond != NO_FACE) & (chosen != NONE)[:, None])
+    there = beyond[face, edge]
+    same = chosen[face] == chosen[there]
+    graph = coo_matrix((np.ones(same.sum(), bool), (face[same], there[same])), (len(chosen), len(chosen)))
+    part = connected_components(graph, directed=False)[1].astype(np.int64)
+    size, stride = np.bincount(part), int(view.max()) + 2
+    # what each part saves by the photograph of a neighbour: its seams with it, and what its triangles cost now
+    seam = np.flatnonzero(~same & (chosen[there] != NONE))
+    wanted, count = np.unique(part[face[seam]] * stride + chosen[there[seam]], return_counts=True)
+    if not len(wanted):
+        return chosen
+    own = np.where(view == chosen[:, None], cost, LARGE).min(1)
+    now = np.bincount(part, own)
+    row, slot = np.nonzero(view != NONE)
+    key = part[row] * stride + view[row, slot]
+    at = np.searchsorted(wanted, key).clip(max=len(wanted) - 1)
+    hit = wanted[at] == key
+    then = np.bincount(at[hit], cost[row[hit], slot[hit]], len(wanted))
+    shown = np.bincount(at[hit], minlength=len(wanted))
+    owner, label = np.divmod(wanted, stride)
+    change = then - now[owner] - SEAM * count
+    usable = np.flatnonzero((shown == size[owner]) & (change < -1e-6))
+    usable = usable[np.lexsort((change[usable], owner[usable]))]
+    usable = usable[np.diff(owner[usable], prepend=-1) > 0]  # the best of each part
+    usable = usable[draw.random(len(usable)) < 0.5]
+    to = np.full(len(size), NONE, np.int64)
+    to[owner[usable]] = label[usable]
+    return np.where(to[part] != NONE, to[part], chosen).astype(np.int32)

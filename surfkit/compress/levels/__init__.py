@@ -1,0 +1,18 @@
+"""Levels of detail: the same scene from fewer splats, for cameras that see it from afar."""
+
+from collections.abc import Mapping
+
+from surfkit.compress.levels.base import LevelsOfDetail
+from surfkit.compress.levels.merge import MergedLevels
+from surfkit.compress.levels.prune import PrunedLevels
+from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """What this folder offers."""
+    return {"merge": MergedLevels, "prune": PrunedLevels}
+
+
+__all__ = ["LevelsOfDetail", "MergedLevels", "PrunedLevels"]

@@ -1,0 +1,145 @@
+"""The CPU rasterizer: the compiled kernels behind the contract of `raster.api`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.raster import native
+from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.validate import validate
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class NativeRasterizer(Rasterizer):
+    """Draws on the CPU with SIMD on `torch.get_num_threads()` threads; their number does not change a bit."""
+
+    rank: ClassVar[int] = 10
+
+    def missing(self) -> str | None:
+        """See `Rasterizer.missing`."""
+        return native.lacking() if native.module() is None else None
+
+    def title(self) -> str:
+        """See `Rasterizer.title`."""
+        return f"cpu {native.module().kernels_in_use()}"
+
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
+        return NativeRender(splats, camera, near, MAPS[: 2 + 3 * geometry + (geometry and distortion)])
+
+    def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.in_view`."""
+        found = torch.empty(len(splats), dtype=torch.bool)
+        native.module().in_view(
+            splats.kind == "surfel",
+            GEOMETRIES.index(splats.geometry),
+            *(t.detach().to("cpu", torch.float32).contiguous() for t in (splats.means, splats.scales)),
+            *_pose_and_lens(camera),
+            near,
+            found,
+            torch.get_num_threads(),
+        )
+        return found.to(splats.means.device)
+
+    def contribution(
+        self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
+    ) -> tuple[Tensor, Tensor]:
+        grey = replace(splats, sh=torch.zeros(len(splats), 1, 3))  # colours cost a third of the projection
+        drawn = _Pass(grey, camera, near)
+        total = torch.zeros(len(splats), dtype=torch.float32)
+        count = torch.zeros(len(splats), dtype=torch.int64)
+        drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())
+        return total, count
+
+    def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+        drawn = _Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
+        opacity = torch.empty(len(points), dtype=torch.float32)
+        drawn.native.probe(camera.project(points).contiguous(), opacity, torch.get_num_threads())
+        return opacity
+
+
+def _pose_and_lens(camera: Camera) -> tuple[list[float], list[float], int, int]:
+    pose = camera.world_to_camera.double().flatten().tolist()
+    return pose, [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
+
+
+class _Pass:
+    """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn."""
+
+    def __init__(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> None:
+        validate(splats, values=False)
+        self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
+        self.seen = torch.empty(len(splats), dtype=torch.bool)
+        self.radii = torch.empty(len(splats), dtype=torch.float32)
+        self.native = native.module().Pass(
+            splats.kind == "surfel",
+            GEOMETRIES.index(splats.geometry),
+            self.arrays,
+            *_pose_and_lens(camera),
+            near,
+            splats.dilation,
+            splats.antialias,
+            rim,
+            self.seen,
+            self.radii,
+            torch.get_num_threads(),
+        )
+        if self.native.first_invalid >= 0:
+            validate(splats)
+            raise BadInput(f"splats: row {self.native.first_invalid} is out of the range of float32")
+
+
+class NativeRender(Render):
+    """A view drawn by the native kernels, when its maps are first asked for; keeps what the backward needs."""
+
+    def __init__(self, splats: Splats, camera: Camera, near: float, made: tuple[str, ...]) -> None:
+        self._pass = _Pass(splats, camera, near)
+        self.seen, self.radii = self._pass.seen, self._pass.radii
+        self._size, self._made = (camera.height, camera.width), made
+
+    @cached_property
+    def maps(self) -> Maps:
+        """See `Render`."""
+        shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
+        maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in self._made}
+        self._pass.native.forward(
+            {2: 0, 5: 1, 6: 2}[len(self._made)], [maps.get(name) for name in MAPS], torch.get_num_threads()
+        )
+        return Maps(**maps)
+
+    def backward(
+        self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
+    ) -> Gradients:
+        arrays = self._pass.arrays
+        rows = len(arrays[0]) if rows is None else rows
+        grads = [torch.empty_like(a[:rows]) for a in arrays]
+        signal = torch.empty(rows, 2)
+        chosen_signal = None if chosen is None else torch.empty(rows, 2)
+        self._pass.native.backward(
+            arrays,
+            self._cotangents(total),
+            [] if chosen is None else self._cotangents(chosen),
+            absolute,
+            rows,
+            grads,
+            signal,
+            chosen_signal,
+            torch.get_num_threads(),
+        )
+        return Gradients(*grads, signal, chosen_signal)
+
+    def _cotangents(self, maps: Maps) -> list[Tensor | None]:
+        given, drawn = maps.present(), self.maps
+        for name, value in given.items():
+            made = getattr(drawn, name)
+            if made is None or made.shape != value.shape:
+                raise BadInput(f"cotangent of {name}: shape {tuple(value.shape)} does not fit the maps rendered")
+        return [given[name].to(torch.float32).contiguous() if name in given else None for name in MAPS]

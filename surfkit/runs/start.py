@@ -1,0 +1,82 @@
+"""The initial points of pretraining."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.io.datasets.depth_prior import Alignment, alignment, prior_bytes, prior_files, read_priors
+from surfkit.io.datasets.panoramas import points_remedy
+from surfkit.io.datasets.read import observations
+from surfkit.runs.folder import Run
+from surfkit.scene.scene import Scene
+from surfkit.start.base import InitialModel, StartInput
+from surfkit.train.data_cache import TrainingData, needs_normals, needs_priors, scale_band
+
+AHEAD = 4
+"""Depth maps in memory while points are made of them: each is needed once."""
+
+
+@dataclass(frozen=True)
+class InitialPoints:
+    """Makes the initial points of a run.
+
+    Attributes:
+        run: The run.
+        scene: Its data.
+        given: Its photographs and masks.
+        known: How the depth priors are aligned, if the start needs any.
+    """
+
+    run: Run
+    scene: Scene
+    given: TrainingData
+    known: Alignment | None
+
+    def __call__(self, generator: torch.Generator) -> InitialModel:
+        """The points; the generator is that of the stage."""
+        start, scene, given = self.run.recipe.start, self.scene, self.given
+        priors = None
+        if start.needs_prior:
+            largest = max(view.camera.width * view.camera.height for view in scene.train)
+            priors = read_priors(self.run.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
+        own = torch.Generator().manual_seed(self.run.recipe.seed)
+        try:
+            known = StartInput(scene, given.photos, given.masks, priors, own)
+            return start.model(self.run.recipe.primitive, known, generator)
+        finally:
+            if priors is not None:
+                priors.close()
+
+
+def align_priors(run: Run, scene: Scene, begun: bool) -> Alignment | None:
+    """The alignment of the depth priors of a run with its scene, if pretraining needs any.
+
+    Raises:
+        BadInput: The run is still to begin, at depth maps, and there are none that can be used.
+    """
+    needed, losses = run.recipe.start.needs_prior and not begun, run.recipe.pretrain.losses
+    if not needed and not needs_priors(losses):
+        return None
+    known = alignment(run.data, scene, needs_normals(losses), scale_band(losses))
+    if needed and not known.fits:
+        raise BadInput(
+            f"{run.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "
+            f"{remedy(run, scene)}, or choose start:sparse"
+        )
+    return known
+
+
+def remedy(run: Run, scene: Scene) -> str:
+    """How to get depth maps that can be used, after those that there are cannot."""
+    if run.data.priors is not None:
+        return "see whether photographs and cameras belong together, and which points they share"
+    if prior_files(run.data, scene):
+        return f"make others with `surfkit prepare depth {shlex.quote(str(run.data.path))} --again`"
+    if observations(run.data, scene).is_empty:
+        return f"stereo needs sparse points: {points_remedy(run.data.path, (view.name for view in scene.train))}"
+    let = "let the run make them, without --no-prepare and with depth:patch-match"
+    return f"make some with `surfkit prepare depth {shlex.quote(str(run.data.path))}`, {let}"

@@ -1,0 +1,35 @@
+"""An ablation table for other programs: one line a row, data set and seed, with plain numbers."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from typing import Any
+
+from surfkit.study.columns import COLUMNS
+from surfkit.study.table import data_name, data_sets
+
+HEAD = ("table", "data", "number", "row", "built_on", "kept", "seed", "folder", *COLUMNS, "failed", "not_as_named")
+
+
+def comma_separated(report: Mapping[str, Any]) -> str:
+    """Every run of the table in seconds, bytes and counts; a row without any run is a line without numbers."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, HEAD, restval="", lineterminator="\n")
+    writer.writeheader()
+    for entry in data_sets(report):
+        for row in entry["rows"]:
+            facts = {
+                "table": report["table"],
+                "data": data_name(entry),
+                "number": row["number"],
+                "row": row["label"],
+                "built_on": row["built_on"] or "",
+                "kept": str(row["kept"]).lower(),
+                "failed": row["failed"] or "",
+                "not_as_named": row.get("not_as_named") or "",
+            }
+            for run in row["runs"] or [{}]:
+                writer.writerow(facts | {name: run[name] for name in HEAD if name in run})
+    return text.getvalue()

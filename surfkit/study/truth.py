@@ -1,0 +1,127 @@
+"""F1 of the meshes of an ablation table, all in one crop volume."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json, write_json
+from surfkit.evaluate.geometry.comparison import Comparison, truth_side
+from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.raster.select import Device
+from surfkit.runs.folder import Run, note_metrics
+from surfkit.runs.measure import note_compressed
+from surfkit.runs.pipeline import loaded, mesh, opened
+from surfkit.runs.resume import read_unchanged
+from surfkit.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What meshes are compared with.
+
+    Attributes:
+        path: A mesh, or a cloud of points.
+        tau: Distance below which a point counts as right; None for what the spacing of a cloud gives.
+    """
+
+    path: Path
+    tau: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", self.path.resolve())
+        self.settings  # noqa: B018 (refuses a threshold of no length)
+
+    @property
+    def settings(self) -> Comparison:
+        """How meshes are compared."""
+        return Comparison(tau=self.tau, classes=False)
+
+    def refuse_unusable(self) -> None:
+        """BadInput for a file that no mesh could be compared with."""
+        truth_side(read_surface(self.path), self.settings)
+
+    @property
+    def stamp(self) -> str | None:
+        """Size and time of the file, by which another one of the same name is noticed; None if it is gone."""
+        try:
+            state = self.path.stat()
+        except OSError:
+            return None
+        return f"{state.st_size} {state.st_mtime_ns}"
+
+    def crop(self, out: Path) -> Path:
+        """Where the crop volume of all rows is kept in the folder of a table."""
+        digest = hashlib.sha256(f"{self.path} {self.tau} {self.stamp}".encode()).hexdigest()[:12]
+        return out / f"crop-{digest}.json"
+
+    def known(self, metrics: Mapping[str, Any], compressed: bool = False) -> bool:
+        """Whether the metrics of a run have the F1 of its mesh, or of that of its compressed model, against this.
+
+        What `surfkit evaluate` has measured with other settings, or in another volume, is not that.
+        """
+        own = metrics.get("compressed") or {} if compressed else metrics
+        geometry = own.get("geometry") or {}
+        made = geometry.get("table")
+        is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
+        return geometry.get("truth") == str(self.path) and is_same and "mesh" in own  # older versions have none
+
+    def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
+        """Compare the mesh of a run, and return its metrics with what came out.
+
+        Where the recipe compresses the model, it is the mesh of the compressed model, which is made here. The first run
+        that is measured decides the crop volume by its views; the others take it from there.
+
+        Args:
+            folder: Of the run.
+            out: Of the table.
+            device: For the depth of the compressed model.
+
+        Raises:
+            BadInput: There is no mesh, or it is nowhere near the truth.
+        """
+        run = opened(folder)
+        shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
+        if not shown.mesh_record.exists():
+            raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
+        found = self.compare(shown.mesh, shown.out / "geometry", out, read_unchanged(run))
+        metrics = note_metrics(shown.metrics, found)
+        return metrics if shown is run else note_compressed(run, metrics)
+
+    def compare(self, mesh: Path, folder: Path, out: Path, scene: Scene) -> dict[str, Any]:
+        """What metrics.json is to say of a mesh in the frame of a scene, against this, in the volume of the table.
+
+        Args:
+            mesh: The file.
+            folder: Gets pictures and clouds.
+            out: Of the table.
+            scene: Whose views decide the volume, if none is kept yet.
+
+        Raises:
+            BadInput: The mesh is nowhere near the truth.
+        """
+        crop = self.crop(out)
+        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
+        found = measure_geometry((mesh, self.path), settings, folder, scene.train, scene.frame)
+        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
+        if not crop.exists():
+            write_json(crop, read_json(folder / "crop.json", Any))
+        return found
+
+
+def mesh_of_compressed(run: Run, device: Device) -> Run:
+    """The folder of the compressed model of a run, with its mesh; made by the mesher of the recipe if it is not there.
+
+    Raises:
+        BadInput: There is no compressed model.
+    """
+    shown = replace(run, out=run.compressed)
+    if not shown.mesh_record.exists():
+        with loaded(run.out, device, compressed=True) as (ctx, made):
+            mesh(ctx, made, device)
+    return shown

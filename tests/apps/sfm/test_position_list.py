@@ -1,0 +1,122 @@
+"""Positions in files: geo.txt of OpenDroneMap, and tables as other programs write them."""
+
+import numpy as np
+import pyproj
+import pytest
+
+from surfkit.apps.sfm.position_list import read_list
+from surfkit.core.check import BadInput
+from surfkit.runs.notes import collect_notes
+from surfkit.scene.earth import utm
+
+PLACE = (-33.9, 151.2, 120.5)
+EAST, NORTH = utm(*PLACE[:2], 56, True)
+
+
+@pytest.fixture
+def listed(tmp_path):
+    def read(text, crs=None):
+        path = tmp_path / "list.txt"
+        path.write_text(text.format(e=f"{EAST:.6f}", n=f"{NORTH:.6f}"), encoding="utf-8-sig")
+        return read_list(path, "list", crs)
+
+    return read
+
+
+METASHAPE = """# CoordinateSystem: WGS 84 / UTM zone 56S (EPSG::32756)
+#Label,X/East,Y/North,Z/Altitude,Accuracy_X/Y_(m),Accuracy_Z_(m),Error_(m),X_error,Y_error,Z_error,X_est,Y_est,Z_est
+a.jpg,{e},{n},120.5,0.02,0.04,9,1,1,1,7,7,7
+b.jpg,,,,,,,,,,,,
+"""
+
+
+@pytest.mark.parametrize(
+    "text, crs",
+    [
+        ("EPSG:4326\na.jpg 151.2 -33.9 120.5\n", None),
+        ("WGS84 UTM 56S\na.jpg {e} {n} 120.5\n", None),
+        ("WGS84 UTM 56s\r\n\r\n# a remark\r\na.jpg\t{e}\t{n}\t120.5\t0\t0\t0\r\n", None),
+        ("'+proj=utm +zone=56 +south +datum=WGS84 +units=m +no_defs'\na.jpg {e} {n} 120.5 0 0 0 1 2 more words", None),
+        ("EPSG:32756\n a.jpg   {e} {n} 120.5", None),
+        ("a.jpg {e} {n} 120.5", "EPSG:32756"),
+        ("a.jpg,{e},{n},120.5,EPSG:32756", None),
+        ("a.jpg, 151.2, -33.9, 120.5, epsg:4326", None),
+        ("name,x,y,z,crs\na.jpg,{e},{n},120.5,32756", None),
+        ("Image;Latitude;Longitude;Altitude\na.jpg;-33,9;151,2;120,5", None),
+        ("#image\tlongitude [deg]\tlatitude [deg]\theight (m)\na.jpg\t151.2\t-33.9\t120.5", None),
+        ('SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n"a.jpg",-33.9,151.2,120.5', None),
+        ("Northing,Easting,Elevation,Photo\n{n},{e},120.5,a.jpg", "WGS84 UTM 56S"),
+        (METASHAPE, None),
+    ],
+)
+def test_forms(listed, text, crs):
+    found = listed(text, crs)
+    assert list(found.positions) == ["a.jpg"]
+    assert found.positions["a.jpg"] == pytest.approx(PLACE, abs=1e-8)
+    degrees = "4326" in text or "ongitude" in text
+    assert found.crs == (None if degrees else "EPSG:32756")
+
+
+def test_well_known_text_is_left_to_pyproj(listed):
+    found = listed(f"#CoordinateSystem: {pyproj.CRS('EPSG:2180').to_wkt('WKT1_GDAL')}\na.jpg,350000,520000,99\n")
+    wanted = pyproj.Transformer.from_crs("EPSG:2180", "EPSG:4326", always_xy=True).transform(350000, 520000)
+    assert found.positions["a.jpg"] == pytest.approx((wanted[1], wanted[0], 99), abs=1e-9) and found.crs == "EPSG:2180"
+
+
+def test_heights_that_are_missing_blanks_in_names_and_accuracies(listed):
+    rows = ["DJI 0001.JPG", "b.jpg", "c.jpg", "d"]
+    rows = [
+        f"{name} 151.2 -33.9{rest}"
+        for name, rest in zip(rows, ("", " nan", " 7 0 0 0 0.5 1.5", " 7 0 0 0 0 0"), strict=True)
+    ]
+    found = listed("\n".join(["EPSG:4326", *rows]))
+    assert {name: at[2] for name, at in found.positions.items()} == {
+        "DJI 0001.JPG": None,
+        "b.jpg": None,
+        "c.jpg": 7,
+        "d": 7,
+    }
+    assert found.accuracies == {"c.jpg": (0.5, 0.5, 1.5)}, "0 says nothing"
+    assert listed(METASHAPE).accuracies == {"a.jpg": (0.02, 0.02, 0.04)}
+    found = listed("name,lon,lat,alt,sd_e (m),sd_n (m),sd_u (m)\na,151.2,-33.9,1,0.1,0.2,0.3")
+    assert found.accuracies == {"a": (0.1, 0.2, 0.3)}
+
+
+@pytest.mark.parametrize("text", ["EPSG:4326\na.jpg 151.2 -33.9\nb.jpg 0 0", "WGS84 UTM 56S\na.jpg {e} {n}\nb.jpg 0 0"])
+def test_places_of_a_receiver_without_a_fix_are_left_out(listed, text):
+    with collect_notes() as notes:
+        assert list(listed(text).positions) == ["a.jpg"]
+    assert "1 positions are no place in EPSG" in notes.texts[0] and "'b.jpg'" in notes.texts[0]
+
+
+def test_several_systems(listed):
+    found = listed("name,x,y,z,crs\na,{e},{n},1,EPSG:32756\nb,151.2,-33.9,1,EPSG:4326")
+    np.testing.assert_allclose(found.positions["a"], found.positions["b"], atol=1e-8)
+    assert found.crs is None and found.named == "EPSG:32756 and EPSG:4326"
+
+
+@pytest.mark.parametrize(
+    "text, crs, said",
+    [
+        ("", None, "list: no positions; each line is name, x"),
+        ("EPSG:4326\n", None, "no positions"),
+        ("a.jpg,{e},{n},1", None, "names no coordinate reference system; .* --positions-crs"),
+        ("EPSG:4326\na.jpg,1,2,3", "EPSG:4326", "names its system itself, 'EPSG:4326'; leave --positions-crs out"),
+        ("name,x,y,crs\na.jpg,1,2,EPSG:4326", "EPSG:4326", "names its system itself"),
+        ("EPSG:4326\na.jpg {e} {n} 1", None, "'a.jpg' is not in degrees, as EPSG:4326 says"),
+        ("WGS84 UTM 56S\na.jpg {n} {e} 1", None, "all positions are where EPSG:32756 does not reach; x is east"),
+        ("EPSG:4326\na.jpg 1 2 3\na.jpg 1 2 4", None, "lines 2 and 3 give two positions for 'a.jpg'"),
+        ("EPSG:4326\na.jpg 1", None, "line 2 is 'a.jpg 1', not name, x"),
+        ("EPSG:4326\na.jpg 1 nan 3", None, "line 2 is 'a.jpg 1 nan 3', not"),
+        ("EPSG:4326\na.jpg,1,,3", None, "line 2 is"),
+        ("foto,ost,nord\na.jpg,1,2", "EPSG:4326", "line 1 is 'foto ost nord', not name, x"),
+        ("WGS84 UTM 56Q\na.jpg 1 2 3", None, "list: 'WGS84 UTM 56Q' has the letter 'Q'"),
+        ("name,x,y,crs\na.jpg,1,2,WGS84 UTM 1\n", None, "list: line 2: 'WGS84 UTM 1' has no letter"),
+        ("a.jpg 1 2 3", "WGS84 UTM 1", "--positions-crs: 'WGS84 UTM 1' has no letter"),
+        ("no system\na.jpg 1 2 3", None, "'no system' is no coordinate reference system"),
+    ],
+)  # fmt: skip
+def test_what_will_not_do(listed, text, crs, said):
+    with pytest.raises(BadInput, match=said) as raised:
+        listed(text, crs)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,98 @@
+"""Which files a mesh becomes."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.core.events import Warned
+from surfkit.io import glb
+from surfkit.io.datasets.data import Data
+from surfkit.mesh import files
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.simplify import simplified
+from surfkit.runs import mesh as delivering
+from surfkit.runs.folder import Run
+from surfkit.runs.mesh import MeshOutput, finished, forget_geometry, levels, write_files
+from surfkit.runs.recipe import Recipe
+from surfkit.scene.scene import Frame
+
+TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
+
+
+@pytest.mark.parametrize(
+    ("formats", "written"), [(["glb"], ["mesh.ply"]), (["glb", "obj"], ["mesh.obj"]), (["ply", "glb"], ["mesh.ply"])]
+)
+def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, written):
+    monkeypatch.setattr(glb, "MOST_BYTES", 500)
+    told = []
+    monkeypatch.setattr(delivering, "emit", told.append)
+    run, subject = SimpleNamespace(out=tmp_path), SimpleNamespace(frame=Frame(np.zeros(3), 1.0))
+    found = list(write_files(run, [("mesh", TRIANGLE)], MeshOutput(formats=tuple(formats)), subject))
+    assert [path.name for path in found] == written == [path.name for path in tmp_path.iterdir()]
+    (warned,) = [event.text for event in told if isinstance(event, Warned)]
+    assert "mesh.glb: " in warned and "at most 500: simplify the mesh" in warned
+    assert ("in its place" in warned) == (formats == ["glb"])
+
+
+def test_the_length_of_a_glb_file_is_known_before_it_is_begun(tmp_path, monkeypatch):
+    path = tmp_path / "mesh.glb"
+    files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size)
+    files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size - 1)
+    with pytest.raises(BadInput, match=f"mesh.glb: {path.stat().st_size} bytes"):
+        files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
+
+
+@pytest.mark.parametrize("part", ["", "compressed"])
+def test_what_was_measured_of_the_mesh_before_is_gone(tmp_path, monkeypatch, part):
+    """The metrics of a run repeat what was measured of the mesh of its compressed model, which is another mesh."""
+    told, out = [], tmp_path / "run"
+    monkeypatch.setattr(delivering, "emit", told.append)
+    (out / "compressed").mkdir(parents=True)
+    own = {"psnr": 20.0, "geometry": {"f1": 0.5}, "mesh": {"triangles": 2}}
+    small = {"psnr": 19.0, "geometry": {"f1": 0.4}, "mesh": {"triangles": 1}}
+    write_json(out / "metrics.json", own | {"compressed": small})
+    write_json(out / "compressed" / "metrics.json", small)
+    forget_geometry(Run(out / part, Recipe(), Data(tmp_path)))
+    found = tuple(json.loads((out / name / "metrics.json").read_text()) for name in ("", "compressed"))
+    if part:
+        assert found == (own | {"compressed": {"psnr": 19.0}}, {"psnr": 19.0})
+    else:
+        assert found == ({"psnr": 20.0, "compressed": small}, small)
+    forget_geometry(Run(out / part, Recipe(), Data(tmp_path)))
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(("metres", "local"), [(None, 0.002), (2.0, 0.001)])
+def test_the_error_is_in_metres_or_else_in_units_of_the_data_set(metres, local):
+    """0.02 in a frame whose unit is a tenth of that of the data set."""
+    x, y = np.meshgrid(*2 * [np.linspace(0, 1, 40)], indexing="ij")
+    at = np.arange(1600).reshape(40, 40)
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    mesh = Mesh(np.stack([x, y, 0.1 * np.sin(5 * x)], 2).reshape(-1, 3).astype(np.float32), faces)
+    subject = SimpleNamespace(frame=Frame(np.zeros(3), 0.1, metres), views=())
+    found, done = finished(mesh, MeshOutput(error=0.02), subject)
+    assert np.array_equal(found.faces, simplified(mesh, error=local).faces) and len(found.faces) < len(faces) / 2
+    assert done == {"simplification": {"triangles_before": len(faces), "triangles": len(found.faces)}}
+    assert finished(mesh, MeshOutput(), subject) == (mesh, {})
+
+
+def test_a_level_that_would_not_be_closed_is_refused():
+    with pytest.raises(BadInput, match="mesh cannot be closed: 3 of its edges do not have two triangles"):
+        levels(TRIANGLE, MeshOutput(watertight=True), Frame(np.zeros(3), 1.0))
+
+
+def test_a_closed_mesh_whose_file_would_not_be_is_refused():
+    """So far from 0 that 32 bits hold whole units only: two corners of a tetrahedron become one."""
+    corners = np.array([[0, 0, 0], [0.2, 0, 0], [0, 9, 0], [0, 0, 9]], np.float32)
+    solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32))
+    far = Frame(np.array([1e7, 0, 0]), 1.0)
+    assert levels(solid, MeshOutput(watertight=True), far) == [("mesh", solid)]
+    with pytest.raises(BadInput, match=r"mesh\.glb cannot be closed: \d of its edges"):
+        levels(solid, MeshOutput(watertight=True, formats=("glb",)), far)
