@@ -86,11 +86,12 @@ def kinds() -> str:
 
 def _home(base: type) -> str:
     """Where a base class is imported from and stands, and what checks its parts."""
-    import surfkit
-    from surfkit import testing
+    from surfkit import plugin, testing
     from surfkit.core.registry import kebab
 
-    shown = f"surfkit.{base.__name__}" if base.__name__ in surfkit.__all__ else f"{base.__module__}.{base.__name__}"
+    shown = (
+        f"surfkit.plugin.{base.__name__}" if base.__name__ in plugin.__all__ else f"{base.__module__}.{base.__name__}"
+    )
     names = (f"check_{kebab(cls.__name__).replace('-', '_')}" for cls in base.__mro__)
     check = next((f", checked by `surfkit.testing.{name}`" for name in names if name in testing.__all__), "")
     return f"`{shown}`, in `{base.__module__.replace('.', '/')}.py`{check}."
@@ -175,15 +176,15 @@ def _docstring(text: str | None, indent: int) -> list[str]:
 
 
 def _import(imports: dict[str, set[str]], cls: type, hints: list[ast.expr | None]) -> None:
-    """Add from where the names in type hints of a class are imported, from surfkit itself if it has them."""
-    import surfkit
+    """Add from where the names in type hints of a class are imported, from surfkit.plugin if it has them."""
+    from surfkit import plugin
 
     for hint in hints:
         for name in {node.id for node in ast.walk(hint) if isinstance(node, ast.Name)} if hint else ():
             found = getattr(importlib.import_module(cls.__module__), name, getattr(builtins, name, None))
             home = getattr(found, "__module__", None)
-            if name in surfkit.__all__:
-                home = "surfkit"
+            if name in plugin.__all__:
+                home = "surfkit.plugin"
             elif inspect.ismodule(found):
                 home = ""
             elif home is None or getattr(importlib.import_module(home), name, None) is not found:

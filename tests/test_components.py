@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import surfkit
+from surfkit import plugin
 from surfkit.cli import main
 from surfkit.cli.recipes import about, recipes
 from surfkit.core import registry
@@ -35,6 +36,9 @@ def test_recipes(name):
 def test_public_names():
     for name in surfkit.__all__:
         assert getattr(surfkit, name) is not None
+    assert len(set(plugin.__all__)) == len(plugin.__all__) > 100 and all(
+        hasattr(plugin, name) for name in plugin.__all__
+    )
     with pytest.raises(AttributeError, match="no attribute 'Prunes'"):
         surfkit.Prunes  # noqa: B018
 

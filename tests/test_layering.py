@@ -43,7 +43,7 @@ TEMPLATES = ROOT / "apps" / "new" / "templates"
 """Files of other packages: `surfkit new` writes them."""
 FILES = sorted(path for path in ROOT.rglob("*.py") if TEMPLATES not in path.parents)
 LONGEST = 400
-ENTRIES = {"__init__", "__main__"}
+ENTRIES = {"__init__", "__main__", "plugin"}
 """Of the package itself, above all folders."""
 
 

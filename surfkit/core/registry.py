@@ -160,8 +160,9 @@ def offered_once(hook: str, what: str) -> dict[str, Any]:
     found: dict[str, tuple[str, Any]] = {}
     for owner, name, value in offered(hook):
         if name in found:
+            first = f"surfkit ({found[name][0]})" if found[name][0] in BUILTIN else found[name][0]
             raise BadInput(
-                f"two packages offer {what} named {name!r}: {found[name][0]} and {owner}; uninstall one, or leave it "
+                f"two packages offer {what} named {name!r}: {first} and {owner}; uninstall one, or leave it "
                 "out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
             )
         found[name] = (owner, value)

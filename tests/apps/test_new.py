@@ -24,7 +24,17 @@ from surfkit.runs.recipe import Recipe
 from surfkit.study.ablation import build, offered_tables
 
 KINDS = write.kinds()
-ALONE = {"executor", "feature-extractor", "feature-matcher", "format", "split", "reader", "depth-layout", "rasterizer"}
+ALONE = {
+    "executor",
+    "feature-extractor",
+    "feature-matcher",
+    "format",
+    "split",
+    "reader",
+    "depth-layout",
+    "rasterizer",
+    "command",
+}
 """Kinds that stand in no recipe."""
 
 
@@ -61,14 +71,14 @@ def site(tmp_path_factory):
 def test_every_kind_has_a_template(monkeypatch):
     monkeypatch.setenv("SURFKIT_PLUGINS", "none")
     registry.reload()
-    assert set(by_kind()) == set(KINDS)
+    assert {*by_kind(), "command"} == set(KINDS)
     registry.reload()
 
 
 def test_the_part_is_listed_under_its_kind(site):
     assert not registry.failures()
     owners = owner_of()
-    for kind in KINDS:
+    for kind in by_kind():
         assert owners[by_kind()[kind][names(kind).part]] == names(kind).package
 
 

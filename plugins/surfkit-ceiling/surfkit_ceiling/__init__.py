@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from surfkit import BadInput, Component, Edit, Points, Prune, Step, StepCount, hookimpl
+from surfkit.plugin import BadInput, Component, Edit, Points, Prune, Step, StepCount, hookimpl
 
 
 @dataclass(frozen=True)

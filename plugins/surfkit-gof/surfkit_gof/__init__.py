@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Row, Stage, hookimpl
-from surfkit.densify import AbsGradient, MatchedADC
-from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
-from surfkit.primitives import Gaussian3D
+from surfkit.plugin import (
+    L1,
+    SSIM,
+    AbsGradient,
+    Component,
+    Distortion,
+    Gaussian3D,
+    MatchedADC,
+    NormalConsistency,
+    Recipe,
+    Row,
+    Stage,
+    hookimpl,
+)
 from surfkit_gof.mesher import OpacityField
 
 GOF = Recipe(

@@ -8,9 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Mesh, Mesher, MeshInput
 from surfkit.mesh.field import least_opacity
 from surfkit.mesh.tetra import FINEST, Edges, pivots
+from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput
 
 
 @dataclass(frozen=True)

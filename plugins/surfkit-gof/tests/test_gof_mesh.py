@@ -7,7 +7,7 @@ import pytest
 import torch
 from surfkit_gof.mesher import OpacityField, in_view
 
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check, check_mesher
 from surfkit.testing.inputs import BALL_RADIUS, mesh_input
 

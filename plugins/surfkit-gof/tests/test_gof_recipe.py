@@ -10,10 +10,10 @@ import torch
 from surfkit_gof import GOF, PAPER
 from surfkit_gof.mesher import OpacityField
 
-from surfkit import Mesher, components, rescale
 from surfkit.core.registry import plugins
 from surfkit.core.schedule import LearningRate
 from surfkit.densify import MatchedADC
+from surfkit.plugin import Mesher, components, rescale
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Row, hookimpl
-from surfkit.primitives import Gaussian3D
+from surfkit.plugin import Component, Gaussian3D, Recipe, Row, hookimpl
 from surfkit_gs2mesh.rendered_stereo import RenderedStereo
 
 GS2MESH = Recipe(

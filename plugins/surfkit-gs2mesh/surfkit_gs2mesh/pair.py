@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from surfkit import BadInput, Camera, DepthEstimator, DepthInput, Observations, Seen, View
+from surfkit.plugin import BadInput, Camera, DepthEstimator, DepthInput, Observations, Seen, View
 
 SIDES = ("left", "right")
 """Names of the two views of a pair."""

@@ -10,13 +10,23 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from surfkit import BadInput, DepthEstimator, Maps, Mesh, Mesher, MeshInput, View, choice, emit
-from surfkit.core.events import Progress
-from surfkit.core.registry import name_of
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.stereo import points
-from surfkit.mesh.tsdf import TSDF
+from surfkit.plugin import (
+    TSDF,
+    BadInput,
+    DepthEstimator,
+    Maps,
+    Mesh,
+    Mesher,
+    MeshInput,
+    Progress,
+    View,
+    choice,
+    emit,
+    name_of,
+)
 from surfkit_gs2mesh.pair import Pair, estimate
 
 OPAQUE = 0.5

@@ -10,11 +10,11 @@ import torch
 from surfkit_gs2mesh.pair import Pair, consistent, estimate
 from surfkit_gs2mesh.rendered_stereo import RenderedStereo
 
-from surfkit import BadInput, Camera, Maps, Mesher, View, components
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import plugins
 from surfkit.depth import DepthAnythingV2, PlaneSweep
 from surfkit.mesh.tsdf import TSDF
+from surfkit.plugin import BadInput, Camera, Maps, Mesher, View, components
 from surfkit.raster.native import module
 from surfkit.testing import check
 from surfkit.testing.inputs import mesh_input

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Stage, hookimpl
-from surfkit.losses import L1, SSIM, MeanOpacity, MeanScale, NormalConsistency
-from surfkit.mesh.tsdf import TSDF
-from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.plugin import (
+    L1,
+    SSIM,
+    TSDF,
+    Component,
+    Gaussian3D,
+    MeanOpacity,
+    MeanScale,
+    NormalConsistency,
+    Recipe,
+    Stage,
+    Surfel2D,
+    hookimpl,
+)
 from surfkit_mcmc.relocation import Relocation
 
 REGULARIZERS = {"opacity": MeanOpacity(weight=0.01), "scale": MeanScale(weight=0.01)}

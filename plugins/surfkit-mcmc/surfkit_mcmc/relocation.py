@@ -9,9 +9,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Densify, Edit, Filter, Points, Step, StepCount, Steps, choice
-from surfkit.densify.base import admitted
-from surfkit.primitives.base import rotated
+from surfkit.plugin import BadInput, Densify, Edit, Filter, Points, Step, StepCount, Steps, admitted, choice, rotated
 
 MOST = 51
 """Points at one place beyond which the sums of the formula lose their digits."""

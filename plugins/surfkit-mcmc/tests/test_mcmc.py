@@ -10,10 +10,10 @@ import surfkit_mcmc
 import torch
 from surfkit_mcmc.relocation import Relocation, drawn, shared
 
-from surfkit import BadInput, Densify, Points, Step, components
 from surfkit.core.registry import plugins
 from surfkit.core.schedule import LearningRate, rescale
 from surfkit.densify import Elongation
+from surfkit.plugin import BadInput, Densify, Points, Step, components
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.edit import apply

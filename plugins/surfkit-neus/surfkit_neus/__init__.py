@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Row, hookimpl
+from surfkit.plugin import Component, Recipe, Row, hookimpl
 from surfkit_neus.method import Neuralangelo, NeuS
 
 RECIPES = {

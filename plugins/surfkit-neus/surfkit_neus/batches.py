@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import MethodInput
+from surfkit.plugin import MethodInput
 from surfkit_neus.box import Rays, SceneBox, camera_rays, joined
 
 

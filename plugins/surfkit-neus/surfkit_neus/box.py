@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
-from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Scene
+from surfkit.plugin import BadInput, Camera, Scene
 from surfkit_neus.field import Shape
 
 FEWEST = 10

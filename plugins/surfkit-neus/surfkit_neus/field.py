@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from surfkit.core.check import require_within
+from surfkit.plugin import require_within
 from surfkit_neus.hashgrid import Grid, HashGrid
 
 Shape = Literal["plane", "sphere"]

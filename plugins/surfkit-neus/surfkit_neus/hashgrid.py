@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from surfkit.core.check import require_within
+from surfkit.plugin import require_within
 
 PRIMES = (1, 2_654_435_761, 805_459_861)
 INITIAL = 1e-4

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Mesh, View, isosurface
-from surfkit.core.files import replacing
+from surfkit.plugin import BadInput, Mesh, View, isosurface, replacing
 from surfkit_neus.box import SceneBox
 from surfkit_neus.field import SurfaceField
 from surfkit_neus.render import Look

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Interval, Method, MethodInput, Reconstruction, Steps, Warned, emit
-from surfkit.core.check import require_within
 from surfkit.core.memory import size
+from surfkit.plugin import BadInput, Interval, Method, MethodInput, Reconstruction, Steps, Warned, emit, require_within
 from surfkit_neus.batches import Batch
 from surfkit_neus.box import Rays, SceneBox, scene_box
 from surfkit_neus.field import BackgroundField, Networks, SurfaceField

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.core.check import require_within
-from surfkit.raster.api import Maps
-from surfkit.scene.scene import View
+from surfkit.plugin import Maps, View, require_within
 from surfkit_neus.box import Rays, SceneBox, camera_rays
 from surfkit_neus.field import BackgroundField, SurfaceField
 from surfkit_neus.gradients import Geometry, analytic, numerical

@@ -11,8 +11,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from surfkit import BadInput
-from surfkit.core.files import replacing
+from surfkit.plugin import BadInput, replacing
 from surfkit.train.adam import update
 from surfkit_neus.field import BackgroundField, SurfaceField
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from surfkit import Fault, MethodInput, StageBegan, StepDone, emit, graceful
 from surfkit.core.memory import peak_memory_bytes
+from surfkit.plugin import Fault, MethodInput, StageBegan, StepDone, emit, graceful
 from surfkit_neus.batches import Batches
 from surfkit_neus.box import SceneBox
 from surfkit_neus.render import draw_rays

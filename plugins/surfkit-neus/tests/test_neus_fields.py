@@ -12,7 +12,7 @@ from surfkit_neus.losses import color_loss, curvature_loss, depth_loss, eikonal_
 from surfkit_neus.sampling import beyond_samples, even_samples, importance_samples, surface_samples
 from surfkit_neus.weights import section_alphas, section_ends, weights_of
 
-from surfkit import BadInput, Camera, Cloud, Frame, Scene, View
+from surfkit.plugin import BadInput, Camera, Cloud, Frame, Scene, View
 
 SMALL = Grid(levels=4, features=3, table_bits=9, coarsest=3, finest=24)
 

@@ -17,11 +17,11 @@ from surfkit_neus.method import Neuralangelo, NeuS
 from surfkit_neus.render import Look, Samples
 from surfkit_neus.train import CHECKPOINT, make_step, train
 
-from surfkit import BadInput, Camera, Cloud, Frame, MethodInput, Scene, StepDone, View, components, hookimpl
 from surfkit.cli import main
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import DepthPrior
+from surfkit.plugin import BadInput, Camera, Cloud, Frame, MethodInput, Scene, StepDone, View, components, hookimpl
 from surfkit.raster.select import select
 from surfkit.runs.methods.base import Method
 from surfkit.study.ablation import build, offered_tables

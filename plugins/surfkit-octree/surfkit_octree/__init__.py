@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from surfkit import Component, LearningRate, Recipe, Row, Stage, hookimpl
-from surfkit.losses import L1, SSIM
-from surfkit.mesh.tsdf import TSDF
+from surfkit.plugin import L1, SSIM, TSDF, Component, LearningRate, Recipe, Row, Stage, hookimpl
 from surfkit_octree.anchors import Anchors
 from surfkit_octree.growth import AnchorGrowth
 from surfkit_octree.start import AnchorVoxels

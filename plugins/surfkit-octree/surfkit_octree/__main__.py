@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from surfkit import BadInput, Camera, Columns
+from surfkit.plugin import BadInput, Camera, Columns
 from surfkit.runs.pipeline import load_run
 from surfkit_octree.anchors import Anchors
 from surfkit_octree.levels import TABLE, Census, LevelTable, census

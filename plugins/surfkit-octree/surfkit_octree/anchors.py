@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from surfkit import (
+from surfkit.plugin import (
     EXP,
     SIGMOID,
     BadInput,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from surfkit import Column, Columns, LearningRate, Splats
+from surfkit.plugin import Column, Columns, LearningRate, Splats
 from surfkit.primitives.columns import sigmoid
 
 SH_C0 = 0.28209479177387814

@@ -10,7 +10,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Columns, Densify, Edit, NewPoints, Points, Step, StepCount, Steps
+from surfkit.plugin import BadInput, Columns, Densify, Edit, NewPoints, Points, Step, StepCount, Steps
 from surfkit.raster.autograd import summed_by_owner
 from surfkit_octree.anchors import FULL
 from surfkit_octree.levels import TABLE, LevelTable, centres, voxels

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import Camera, Columns
+from surfkit.plugin import Camera, Columns
 
 TABLE = "lod"
 """The shared parameter that holds a `LevelTable`; nothing trains it."""

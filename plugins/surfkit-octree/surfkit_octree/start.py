@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Cloud, InitialModel, Primitive, Start, StartInput
+from surfkit.plugin import BadInput, Cloud, InitialModel, Primitive, Start, StartInput
 from surfkit.primitives.init import gaps
 from surfkit_octree.anchors import Anchors
 from surfkit_octree.levels import MOST_LEVELS, TABLE, LevelTable, centres, level_count, view_distances, voxels

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from surfkit import Regularizer, Splats
+from surfkit.plugin import Regularizer, Splats
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from surfkit_octree.decode import decode
 from surfkit_octree.growth import GRAD, OPACITY, SEEN, VIEWS
 from surfkit_octree.levels import TABLE, LevelTable, census, is_in_view, level_count, view_distances
 
-from surfkit import BadInput, Camera, Cloud, Densify, Derived, Maps, Points, Splats, Step, components
 from surfkit.core.registry import plugins
+from surfkit.plugin import BadInput, Camera, Cloud, Densify, Derived, Maps, Points, Splats, Step, components
 from surfkit.raster.select import select
 from surfkit.testing import check, check_component, check_densify, check_policy, check_primitive
 from surfkit.testing.inputs import KnownViews, start_input

@@ -11,11 +11,11 @@ from surfkit_octree import OCTREE, SCAFFOLD, AnchorGrowth
 from surfkit_octree.__main__ import main as report
 from surfkit_octree.levels import TABLE, LevelTable
 
-from surfkit import Densify, LearningRate, Points, components
 from surfkit.cli import main
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
+from surfkit.plugin import Densify, LearningRate, Points, components
 from surfkit.raster.select import select
 from surfkit.runs.pipeline import with_steps
 from surfkit.scene.photos import photo_cache

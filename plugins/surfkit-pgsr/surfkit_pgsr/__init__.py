@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Row, Stage, hookimpl
-from surfkit.densify import AbsGradient
-from surfkit.losses import L1, SSIM, Reprojection, WarpedPatches
+from surfkit.plugin import L1, SSIM, AbsGradient, Component, Recipe, Reprojection, Row, Stage, WarpedPatches, hookimpl
 from surfkit_pgsr.densify import FewViews, TwoThresholdADC
 from surfkit_pgsr.exposure import GainOffset
 from surfkit_pgsr.losses import EdgeAwareNormal, MeanThickness

@@ -9,9 +9,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Densify, Edit, Points, Prune, Step, StepCount, Steps, admitted
-from surfkit.densify import ADC, CountCap
 from surfkit.densify.adc import GRAD, SEEN
+from surfkit.plugin import ADC, BadInput, CountCap, Densify, Edit, Points, Prune, Step, StepCount, Steps, admitted
 
 ABSOLUTE, RADIUS = "two-threshold/absolute", "two-threshold/radius"
 

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import Appearance, BadInput, Columns, Primitive, Steps
-from surfkit.core.registry import name_of
-from surfkit.primitives.init import SH_C0
+from surfkit.plugin import SH_C0, Appearance, BadInput, Columns, Primitive, Steps, name_of
 
 
 @dataclass(frozen=True)

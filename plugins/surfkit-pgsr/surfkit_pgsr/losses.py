@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Loss, Maps, Regularizer, Splats, Steps, Target
+from surfkit.plugin import BadInput, Loss, Maps, Regularizer, Splats, Steps, Target
 from surfkit.raster.normals import normals_of
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from surfkit import BadInput, Camera, Maps, Mesh, Mesher, MeshInput, View
-from surfkit.mesh.tsdf import TSDF
+from surfkit.plugin import TSDF, BadInput, Camera, Maps, Mesh, Mesher, MeshInput, View
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surfkit import (
+from surfkit.plugin import (
+    SH_C0,
     Camera,
     Cloud,
     Column,
     Columns,
     DerivedRender,
+    Gaussian3D,
     Gradients,
     Maps,
     Primitive,
@@ -22,8 +24,6 @@ from surfkit import (
     Splats,
     rotated,
 )
-from surfkit.primitives import Gaussian3D
-from surfkit.primitives.init import SH_C0
 
 OPAQUE = 0.5
 """Alpha from which a pixel has a median depth, as for the rasterizers' own."""

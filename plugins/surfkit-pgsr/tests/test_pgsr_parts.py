@@ -13,11 +13,23 @@ from surfkit_pgsr.exposure import GainOffset
 from surfkit_pgsr.losses import EdgeAwareNormal, MeanThickness, edges
 from surfkit_pgsr.planes import PlanarGaussian
 
-from surfkit import BadInput, Camera, Cloud, Contribution, Maps, Points, Primitive, Step, Target, View, components
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import plugins
 from surfkit.core.schedule import LearningRate, rescale
 from surfkit.densify import ADC, Elongation, LossGradient
+from surfkit.plugin import (
+    BadInput,
+    Camera,
+    Cloud,
+    Contribution,
+    Maps,
+    Points,
+    Primitive,
+    Step,
+    Target,
+    View,
+    components,
+)
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.init import SH_C0
 from surfkit.raster.select import select

@@ -8,8 +8,8 @@ import torch
 from surfkit_pgsr.mesh import MaxAngleTSDF, within
 from surfkit_pgsr.planes import PlanarGaussian, PlaneRender, plane_depth, plane_distances
 
-from surfkit import Camera, Maps, Mesher, Primitive, Splats, components
 from surfkit.core.registry import plugins
+from surfkit.plugin import Camera, Maps, Mesher, Primitive, Splats, components
 from surfkit.primitives.init import facing
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Recipe, Row, Stage, hookimpl
-from surfkit.densify import AbsGradient, MatchedADC
-from surfkit.losses import L1, SSIM, NormalConsistency
-from surfkit.mesh.tsdf import TSDF
-from surfkit.primitives import Gaussian3D
+from surfkit.plugin import (
+    L1,
+    SSIM,
+    TSDF,
+    AbsGradient,
+    Gaussian3D,
+    MatchedADC,
+    NormalConsistency,
+    Recipe,
+    Row,
+    Stage,
+    hookimpl,
+)
 
 WEIGHT, OF_EXPECTED = 0.05, 0.4
 """Weight of both normal terms together, and the share of that of the expected depth."""

@@ -9,10 +9,10 @@ import surfkit_radegs
 import torch
 from surfkit_radegs import RADEGS
 
-from surfkit import rescale
 from surfkit.core.registry import offered, plugins
 from surfkit.core.schedule import LearningRate
 from surfkit.losses.base import Target
+from surfkit.plugin import rescale
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement_reference

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from surfkit import Component, LearningRate, Recipe, Row, Stage, hookimpl
-from surfkit.densify import ADC
-from surfkit.primitives import Gaussian3D
+from surfkit.plugin import ADC, Component, Gaussian3D, LearningRate, Recipe, Row, Stage, hookimpl
 from surfkit_sugar.bind import BindToMesh
 from surfkit_sugar.bound import AdjacentNormals, BoundMesh, MeshBound
 from surfkit_sugar.mesh import LevelSetPoisson

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from surfkit import (
+from surfkit.mesh.simplify import require_simplification, simplify_to
+from surfkit.plugin import (
     SIGMOID,
     BadInput,
     Columns,
@@ -25,7 +26,6 @@ from surfkit import (
     View,
     choice,
 )
-from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit_sugar.bound import AdjacentNormals, MeshBound, sound
 from surfkit_sugar.density import Ellipsoids, gathered, whitened
 from surfkit_sugar.mesh import LevelSetPoisson

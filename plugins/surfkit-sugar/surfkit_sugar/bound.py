@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit import (
+from surfkit.plugin import (
+    SH_C0,
     BadInput,
     Cloud,
     Column,
     Columns,
+    Flat3D,
     LearningRate,
     Mesh,
     Mesher,
@@ -22,13 +24,12 @@ from surfkit import (
     Primitive,
     Regularizer,
     Splats,
+    Surfel2D,
     facing,
     rotated,
     seeds,
     standard_columns,
 )
-from surfkit.primitives import Flat3D, Surfel2D
-from surfkit.primitives.init import SH_C0
 from surfkit.scene.rotations import quaternions
 from surfkit_sugar.density import gathered
 from surfkit_sugar.triangles import SLIVER, corners, ellipses, frames, packed, pairs, turned

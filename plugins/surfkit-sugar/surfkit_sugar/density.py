@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit import Splats
+from surfkit.plugin import Splats
 from surfkit.scene.rotations import rotations
 
 THICKNESS = 0.1

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from surfkit import BadInput, Mesh, Mesher, MeshInput
 from surfkit.mesh.poisson import ENOUGH, reconstructed, require_open3d, seen_pixels
 from surfkit.mesh.simplify import require_simplification, simplify_to
+from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput
 from surfkit_sugar.density import Ellipsoids, density, gathered, turned, whitened
 from surfkit_sugar.neighbours import nearest
 

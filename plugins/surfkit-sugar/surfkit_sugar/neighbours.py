@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from surfkit import RegularizerInput
+from surfkit.plugin import RegularizerInput
 
 AT, PLACES = "sugar/at", ("sugar/x", "sugar/y", "sugar/z")
 """Columns that are kept with the points: the step of the last refresh, and where the points were then."""

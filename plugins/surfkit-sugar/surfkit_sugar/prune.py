@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from surfkit import BadInput, Edit, Points, Prune, Step, Steps
+from surfkit.plugin import BadInput, Edit, Points, Prune, Step, Steps
 
 
 @dataclass(frozen=True)

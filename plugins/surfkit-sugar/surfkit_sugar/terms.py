@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from surfkit import BadInput, Interval, Regularizer, RegularizerInput, Splats, Steps
 from surfkit.losses.two_views import is_whole, projected, sampled, surface_depth
+from surfkit.plugin import BadInput, Interval, Regularizer, RegularizerInput, Splats, Steps
 from surfkit_sugar.density import Ellipsoids, density, gathered
 from surfkit_sugar.neighbours import nearest, remembered
 

@@ -14,7 +14,6 @@ from surfkit_sugar.bind import colors_near
 from surfkit_sugar.bound import sound
 from surfkit_sugar.triangles import ellipses, frames, packed, pairs
 
-from surfkit import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, components, evolve, hookimpl
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
 from surfkit.evaluate.geometry.surface import read_surface
@@ -22,6 +21,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.splats.ply import read_splats
 from surfkit.mesh.poisson import require_open3d
 from surfkit.mesh.simplify import require_simplification
+from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, components, evolve, hookimpl
 from surfkit.primitives import Surfel2D
 from surfkit.runs.blocks.schedule import Compute
 from surfkit.runs.pipeline import load_run, run

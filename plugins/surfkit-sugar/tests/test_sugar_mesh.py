@@ -12,9 +12,9 @@ from surfkit_sugar.density import Ellipsoids, density, gathered
 from surfkit_sugar.mesh import Search
 from torch.nn.functional import normalize
 
-from surfkit import BadInput, Mesher, Splats, components
 from surfkit.core.registry import plugins
 from surfkit.mesh.poisson import require_open3d
+from surfkit.plugin import BadInput, Mesher, Splats, components
 from surfkit.testing import check
 from surfkit.testing.inputs import BALL_RADIUS, mesh_input, splats
 

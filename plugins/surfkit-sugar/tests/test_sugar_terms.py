@@ -14,10 +14,10 @@ from surfkit_sugar.density import THICKNESS, Ellipsoids, density, gathered
 from surfkit_sugar.neighbours import AT, nearest, remembered
 from surfkit_sugar.terms import capped, deviations, distances
 
-from surfkit import BadInput, Maps, Points, Regularizer, RegularizerInput, Splats, View, components, dump, load
 from surfkit.core.registry import plugins
 from surfkit.core.schedule import rescale
 from surfkit.losses.base import Target
+from surfkit.plugin import BadInput, Maps, Points, Regularizer, RegularizerInput, Splats, View, components, dump, load
 from surfkit.primitives.edit import Edit, apply
 from surfkit.raster.select import select
 from surfkit.runs.shared import part_keys

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.apps.new.names import Names, checked_names
-from surfkit.apps.new.write import template_of, write_package
+from surfkit.apps.new.write import Template, template_of, write_package
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class NewPlugin:
     """Name of the package in kebab-case, such as surfkit-oversized."""
 
     kind: str = "prune"
-    """Kind of the part: one of those that `surfkit components` lists, such as prune, densify, loss or mesher."""
+    """Kind of the part: one of those that `surfkit components` lists, such as prune, densify, loss or mesher, or
+    `command` for a command of surfkit."""
 
     out: Path | None = None
     """Folder to write, which must not exist. Default: NAME."""
@@ -36,21 +37,21 @@ class NewPlugin:
         names = checked_names(self.name, self.kind, template)
         out = self.out or Path(self.name)
         write_package(out, names, template)
-        print(_next(out, names, template.is_in_recipes))
+        print(_next(out, names, template))
 
 
 COMMAND = {"plugin": NewPlugin}
 
 
-def _next(out: Path, names: Names, is_in_recipes: bool) -> str:
+def _next(out: Path, names: Names, template: Template) -> str:
     """What was written, and the commands that come next."""
     folder = shlex.quote(str(out))
     steps = [
         (f"pip install -e {folder}", "install it; later changes of its files need no other installation"),
-        (f"surfkit components {names.kind}", f"see {names.part} among the others"),
+        (template.listed, f"see {names.part} among the others"),
         (f"pytest {folder}/tests", "run its tests"),
     ]
-    if is_in_recipes:
+    if template.is_in_recipes:
         steps.append((f"surfkit ablate table:{names.part} --data DATA", "train without it and with it, and compare"))
     width = max(len(command) for command, _ in steps)
     lines = [f"  {command:<{width}}  # {what}" for command, what in steps]

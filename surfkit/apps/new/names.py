@@ -96,7 +96,12 @@ def _there(names: Names) -> Iterator[tuple[str, str]]:
         yield "an installed package", names.package
     if names.part in {plugin.name for plugin in records()}:
         yield "a plugin", names.part
-    words = {"surfkit_components": "a component", "surfkit_recipes": "a recipe", "surfkit_tables": "an ablation table"}
+    words = {
+        "surfkit_components": "a component",
+        "surfkit_recipes": "a recipe",
+        "surfkit_tables": "an ablation table",
+        "surfkit_commands": "a command",
+    }
     for hook, what in words.items():
         if names.part in {name for _, name, _ in offered(hook)}:
             yield what, names.part

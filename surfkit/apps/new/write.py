@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).parent / "templates"
 COMMON = TEMPLATES / "common"
+COMMAND = "command"
+"""What a package can offer beside components."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Template:
     """What the files of a plugin of one kind are made from.
 
     Attributes:
-        kind: As `surfkit components` names it.
+        kind: As `surfkit components` names it, or "command".
         part: Text of the module of the part.
         init: Of the package's `__init__.py`, with its hooks.
         test: Of its tests.
@@ -46,6 +48,11 @@ class Template:
     test: str
     use: str
     is_in_recipes: bool
+
+    @property
+    def listed(self) -> str:
+        """The command that lists the part among others."""
+        return "surfkit plugins" if self.kind == COMMAND else f"surfkit components {self.kind}"
 
     @property
     def python(self) -> dict[str, str]:
@@ -71,19 +78,17 @@ def template_of(kind: str) -> Template:
     if kind not in kinds():
         known = by_kind()
         if kind not in known:
-            raise BadInput(unknown("kind of component", kind, known))
+            raise BadInput(unknown("kind of component", kind, [*known, COMMAND]))
         raise BadInput(
             f"no template for the kind {kind!r}; those with one are {', '.join(kinds())}; docs/kinds.md shows what a "
             f"{kind} must write, to replace the part of another kind with"
         )
     folder = TEMPLATES / kind
     part, test = _text(folder / "part.py"), _text(folder / "test.py")
-    is_in_recipes = "\nCHANGE: " in part or (folder / "init.py").is_file()
-    init = (
-        folder / "init.py" if (folder / "init.py").is_file() else COMMON / ("init.py" if is_in_recipes else "alone.py")
-    )
+    common = COMMON / ("init.py" if "\nCHANGE: " in part else "alone.py")
+    init = _text(folder / "init.py" if (folder / "init.py").is_file() else common)
     use = folder / "use.txt" if (folder / "use.txt").is_file() else COMMON / "use.txt"
-    return Template(kind, part, _text(init), test, _text(use).strip(), is_in_recipes)
+    return Template(kind, part, init, test, _text(use).strip(), "surfkit_tables" in init)
 
 
 def write_package(out: Path, names: Names, template: Template) -> None:
@@ -104,9 +109,11 @@ def files(names: Names, template: Template) -> Iterator[tuple[str, str]]:
     """Path and text of each file of a plugin."""
     needs = ", ".join(f'"{name}"' for name in _dependencies(template))
     tables = (COMMON / "readme_table.md").read_text(encoding="utf-8") if template.is_in_recipes else ""
+    readme = _text(COMMON / "README.md").replace("NEW_TABLE\n", tables)
+    readme = readme.replace("NEW_USE", template.use).replace("NEW_LIST", template.listed)
     texts = {
         ".gitignore": _text(COMMON / "gitignore"),
-        "README.md": _text(COMMON / "README.md").replace("NEW_TABLE\n", tables).replace("NEW_USE", template.use),
+        "README.md": readme,
         "pyproject.toml": _text(COMMON / "pyproject.toml").replace('"NEW_NEEDS"', needs),
         **template.python,
     }

@@ -5,7 +5,7 @@ from acme_surfkit.cards import Cards
 from acme_surfkit.charbonnier import Charbonnier
 from acme_surfkit.far import Far
 from acme_surfkit.top_share import TopShare
-from surfkit import Recipe, Row, Stage, Table, hookimpl
+from surfkit.plugin import Recipe, Row, Stage, Table, hookimpl
 
 
 @hookimpl

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from surfkit import SIGMOID, Column, Primitive, Splats, harmonics, seeds, standard_columns
+from surfkit.plugin import SIGMOID, Column, Primitive, Splats, harmonics, seeds, standard_columns
 
 
 @dataclass(frozen=True)

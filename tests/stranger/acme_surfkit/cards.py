@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from surfkit import BadInput, Mesh, Mesher
+from surfkit.plugin import BadInput, Mesh, Mesher
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from surfkit import Loss
+from surfkit.plugin import Loss
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from surfkit import BadInput, Edit, Prune
+from surfkit.plugin import BadInput, Edit, Prune
 
 
 @dataclass(frozen=True)

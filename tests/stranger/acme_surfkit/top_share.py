@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from surfkit import Densify, Edit
+from surfkit.plugin import Densify, Edit
 
 GRAD = "acme/grad"
 

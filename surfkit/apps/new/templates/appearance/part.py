@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import Appearance, BadInput, Columns, Primitive, log_linear
+from surfkit.plugin import Appearance, BadInput, Columns, Primitive, log_linear
 from torch import Tensor
 
 SH0 = 0.28209479177387814

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from surfkit import Component, Recipe, Row, Table, hookimpl
-from surfkit.partition import QuantileGrid
-from surfkit.study.recipes import SURFELS
+from surfkit.plugin import Component, QuantileGrid, Recipe, Row, SURFELS, Table, hookimpl
 
 from .new_part import NewPart
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from surfkit import Assign, BadInput, Cells, CoarseModel
+from surfkit.plugin import Assign, BadInput, Cells, CoarseModel
 from torch import Tensor
 
 

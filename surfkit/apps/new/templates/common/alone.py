@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, hookimpl
+from surfkit.plugin import Component, hookimpl
 
 from .new_part import NewPart
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from surfkit import Component, Recipe, Row, Table, evolve, hookimpl
-from surfkit.study.recipes import SURFELS
+from surfkit.plugin import Component, Recipe, Row, SURFELS, Table, evolve, hookimpl
 
 from .new_part import CHANGE, NewPart
 

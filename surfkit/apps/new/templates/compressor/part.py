@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import BadInput, Compressor, Plan, SplatModel
+from surfkit.plugin import BadInput, Compressor, Plan, SplatModel
 from surfkit.compress.scalars import Floats
 from torch import Tensor
 

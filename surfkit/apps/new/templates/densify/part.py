@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import BadInput, Densify, Edit, Interval, Points, Step
+from surfkit.plugin import BadInput, Densify, Edit, Interval, Points, Step
 
 SUM, COUNT = "new-part/sum", "new-part/count"
 """Statistics of the points; they are saved and follow every edit."""

@@ -1,5 +1,5 @@
 import pytest
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from surfkit import BadInput, DepthEstimator, DepthInput, Estimate
-from surfkit.losses import DepthRegression
+from surfkit.plugin import BadInput, DepthEstimator, DepthInput, DepthRegression, Estimate
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from surfkit import BadInput, DepthFile, DepthLayout, DepthQuery
+from surfkit.plugin import BadInput, DepthFile, DepthLayout, DepthQuery
 
 
 @dataclass(frozen=True)

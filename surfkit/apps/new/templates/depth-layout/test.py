@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from surfkit import BadInput, DepthQuery
+from surfkit.plugin import BadInput, DepthQuery
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

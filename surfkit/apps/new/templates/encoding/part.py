@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from surfkit import BadInput, ColumnType, Columns, Compressor, Encoding, Leaf, Plan, SplatModel, choice
+from surfkit.plugin import BadInput, ColumnType, Columns, Compressor, Encoding, Leaf, Plan, SplatModel, choice
 from surfkit.compress.encoding import Streams, Tables, flat, from_whole, multiples
 from surfkit.compress.scalars import Floats
 from torch import Tensor

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from surfkit import IDENTITY, BadInput, ColumnType, Leaf
+from surfkit.plugin import BadInput, ColumnType, IDENTITY, Leaf
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart, NewPartFiles

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from surfkit import Executor, Job, JobResult
+from surfkit.plugin import Executor, Job, JobResult
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from surfkit import Job
+from surfkit.plugin import Job
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, maximum_filter, sobel
 from torch import Tensor
-from surfkit import BadInput, FeatureExtractor, Features, Find
+from surfkit.plugin import BadInput, FeatureExtractor, Features, Find
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from surfkit import BadInput, FeatureMatcher, MatchInput
+from surfkit.plugin import BadInput, FeatureMatcher, MatchInput
 
 
 @dataclass(frozen=True)

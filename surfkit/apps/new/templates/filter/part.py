@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, Filter, Step
+from surfkit.plugin import BadInput, Filter, Step
 from torch import Tensor
 
 

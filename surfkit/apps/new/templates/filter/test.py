@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

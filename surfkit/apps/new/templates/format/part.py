@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from surfkit import BadInput, Format, Frame, SplatTable, Tile
-from surfkit.core.files import replacing
+from surfkit.plugin import BadInput, Format, Frame, SplatTable, Tile, replacing
 
 SH0 = 0.28209479177387814
 """The spherical harmonic of degree 0: a colour is 0.5 + SH0 x coefficient."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, LevelsOfDetail, LodBlock, LodInput, LodTree
+from surfkit.plugin import BadInput, LevelsOfDetail, LodBlock, LodInput, LodTree
 
 
 @dataclass(frozen=True)

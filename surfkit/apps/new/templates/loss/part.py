@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, Loss, Maps, Target
+from surfkit.plugin import BadInput, Loss, Maps, Target
 from torch import Tensor
 
 

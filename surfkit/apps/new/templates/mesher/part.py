@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.sparse import coo_array
-from surfkit import BadInput, Mesh, Mesher, MeshInput, choice
-from surfkit.mesh import TSDF
+from surfkit.plugin import BadInput, Mesh, MeshInput, Mesher, TSDF, choice
 
 
 @dataclass(frozen=True)

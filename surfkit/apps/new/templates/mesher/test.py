@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart, smoothed

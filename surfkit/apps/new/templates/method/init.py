@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit import Component, Recipe, Row, Table, hookimpl
-from surfkit.study.recipes import SURFELS
+from surfkit.plugin import Component, Recipe, Row, SURFELS, Table, hookimpl
 
 from .new_part import NewPart
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.spatial import Delaunay
-from surfkit import BadInput, Ground, Mesh, Method, MethodInput, Reconstruction
+from surfkit.plugin import BadInput, Ground, Mesh, Method, MethodInput, Reconstruction
 
 
 @dataclass(frozen=True)

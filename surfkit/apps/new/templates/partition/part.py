@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import BadInput, Cells, CoarseModel, Ground, Partition
-from surfkit.study.recipes import SURFELS
+from surfkit.plugin import BadInput, Cells, CoarseModel, Ground, Partition, SURFELS
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import SIGMOID, Cloud, Column, Columns, Primitive, Splats, SplatTable, harmonics, seeds, standard_columns
-from surfkit.primitives import Gaussian3D
+from surfkit.plugin import (
+    Cloud,
+    Column,
+    Columns,
+    Gaussian3D,
+    Primitive,
+    SIGMOID,
+    SplatTable,
+    Splats,
+    harmonics,
+    seeds,
+    standard_columns,
+)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 import torch
-from surfkit import Cloud
+from surfkit.plugin import Cloud
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, Edit, Interval, Points, Prune, Step
+from surfkit.plugin import BadInput, Edit, Interval, Points, Prune, Step
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from surfkit import Camera, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.plugin import Camera, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.reference import Reference
 from torch import Tensor
 

@@ -1,5 +1,5 @@
 import torch
-from surfkit import Camera
+from surfkit.plugin import Camera
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select
 from surfkit.testing import check

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from surfkit import BadInput, Capture, Data, Reader, Shot, camera_of, leaving_out
+from surfkit.plugin import BadInput, Capture, Data, Reader, Shot, camera_of, leaving_out
 
 TABLE = "new-part.csv"
 """A line for each photograph: its name, width and height in pixels, fx, fy, cx, cy, and the twelve numbers of the first

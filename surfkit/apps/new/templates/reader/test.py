@@ -1,5 +1,5 @@
 import pytest
-from surfkit import BadInput, Data
+from surfkit.plugin import BadInput, Data
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

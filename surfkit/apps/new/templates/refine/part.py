@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from surfkit import BadInput, LearningRate, Primitive, Refine, Stage
+from surfkit.plugin import BadInput, LearningRate, Primitive, Refine, Stage
 
 KEPT = {name: LearningRate(0.0) for name in ("means", "scales", "quats", "opacities")}
 """Learning rates of what stays as it is."""

@@ -1,8 +1,7 @@
 from types import SimpleNamespace
 
 import pytest
-from surfkit import BadInput
-from surfkit.primitives import Surfel2D
+from surfkit.plugin import BadInput, Surfel2D
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

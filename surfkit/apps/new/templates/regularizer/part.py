@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, Regularizer, Splats
+from surfkit.plugin import BadInput, Regularizer, Splats
 from torch import Tensor
 
 

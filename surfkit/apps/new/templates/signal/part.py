@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit import BadInput, Signal
+from surfkit.plugin import BadInput, Signal
 from torch import Tensor
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from surfkit import BadInput, Capture, Split
+from surfkit.plugin import BadInput, Capture, Split
 
 
 @dataclass(frozen=True)

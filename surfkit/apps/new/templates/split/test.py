@@ -1,7 +1,7 @@
 from types import SimpleNamespace
 
 import pytest
-from surfkit import BadInput
+from surfkit.plugin import BadInput
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart

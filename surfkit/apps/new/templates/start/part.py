@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from surfkit import BadInput, Cloud, Start, StartInput
+from surfkit.plugin import BadInput, Cloud, Start, StartInput
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit import BadInput, DepthPrior, Depths, Maps, Trust
+from surfkit.plugin import BadInput, DepthPrior, Depths, Maps, Trust
 from torch import Tensor
 
 

@@ -1,0 +1,259 @@
+"""What plugins are written with: the kinds of components, what their methods take and give, and the marks.
+
+One name, one import: `from surfkit.plugin import Loss, Target, hookimpl`. `surfkit.testing` checks what is written.
+"""
+
+from __future__ import annotations
+
+from surfkit.appearance.base import Appearance
+from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, Find, MatchInput
+from surfkit.compress.base import Compressor, Plan
+from surfkit.compress.encoding import ColumnType, Encoding
+from surfkit.compress.levels.base import LevelsOfDetail, LodInput
+from surfkit.compress.levels.tree import LodBlock, LodBlocks, LodTree
+from surfkit.compress.octree import Leaf
+from surfkit.compress.streams import Stored
+from surfkit.core.check import BadInput, Fault, expect, leaving_out, reject, require_within
+from surfkit.core.codec import dump, load, read_json, write_json
+from surfkit.core.events import (
+    FileWritten,
+    Measured,
+    MemoryTaken,
+    PhotoSkipped,
+    PointsEdited,
+    Progress,
+    StageBegan,
+    StageEnded,
+    StepDone,
+    Warned,
+    emit,
+)
+from surfkit.core.files import replacing
+from surfkit.core.hooks import LazyCommand, hookimpl
+from surfkit.core.registry import Component, choice, components, find, name_of
+from surfkit.core.schedule import Interval, LearningRate, StepCount, Steps, log_linear, rescale
+from surfkit.core.tree import evolve
+from surfkit.densify import ADC, AbsGradient, CountCap, MatchedADC
+from surfkit.densify.base import Contribution, Densify, Filter, Policy, Prune, Signal, Step, Views, admitted
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.io.datasets.base import Reader
+from surfkit.io.datasets.capture import Capture, Shot, Tracks, camera_of
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_files import DepthFile
+from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
+from surfkit.io.datasets.depth_prior import DepthPrior
+from surfkit.io.datasets.split import Split
+from surfkit.io.splats.axes import FileAxes
+from surfkit.io.splats.base import Format
+from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.losses import (
+    L1,
+    SSIM,
+    DepthRegression,
+    Distortion,
+    MeanOpacity,
+    MeanScale,
+    NormalConsistency,
+    Reprojection,
+    WarpedPatches,
+)
+from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
+from surfkit.mesh import TSDF
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.isosurface import isosurface
+from surfkit.mesh.overlap import Depths
+from surfkit.mesh.trust import Trust
+from surfkit.partition import QuantileGrid
+from surfkit.partition.assign import Assign
+from surfkit.partition.base import Cells, CoarseModel, Contraction, Ground, Partition
+from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
+from surfkit.primitives.base import Primitive, harmonics, rotated
+from surfkit.primitives.columns import EXP, IDENTITY, SIGMOID, Activation, Column, standard_columns
+from surfkit.primitives.edit import Edit, NewPoints
+from surfkit.primitives.init import SH_C0, facing, seeds
+from surfkit.primitives.model import SplatModel
+from surfkit.primitives.points import Columns, Points
+from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.autograd import AutogradRender, DerivedRender
+from surfkit.runs.execute.base import Executor, Job, JobResult
+from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
+from surfkit.runs.recipe import Recipe
+from surfkit.scene.camera import Camera
+from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.pixels import Pixels
+from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
+from surfkit.start.base import InitialModel, Start, StartInput
+from surfkit.study.ablation import Row, Table
+from surfkit.study.recipes import SURFELS
+from surfkit.train.interrupt import graceful
+from surfkit.train.refine.base import Refine
+from surfkit.train.stage import Stage
+
+__all__ = [
+    "ADC",
+    "AbsGradient",
+    "Activation",
+    "Appearance",
+    "Assign",
+    "AutogradRender",
+    "BadInput",
+    "Camera",
+    "Capture",
+    "Cells",
+    "Cloud",
+    "CoarseModel",
+    "Column",
+    "ColumnType",
+    "Columns",
+    "Component",
+    "Compressor",
+    "Contraction",
+    "Contribution",
+    "CountCap",
+    "Data",
+    "Densify",
+    "DepthEstimator",
+    "DepthFile",
+    "DepthInput",
+    "DepthLayout",
+    "DepthPrior",
+    "DepthQuery",
+    "DepthRegression",
+    "Depths",
+    "Derived",
+    "DerivedRender",
+    "Distortion",
+    "EXP",
+    "Edit",
+    "Encoding",
+    "Estimate",
+    "Executor",
+    "Fault",
+    "FeatureExtractor",
+    "FeatureMatcher",
+    "Features",
+    "FileAxes",
+    "FileWritten",
+    "Filter",
+    "Find",
+    "Flat3D",
+    "Format",
+    "Frame",
+    "Gaussian3D",
+    "Gradients",
+    "Ground",
+    "IDENTITY",
+    "InitialModel",
+    "Interval",
+    "Job",
+    "JobResult",
+    "L1",
+    "LazyCommand",
+    "Leaf",
+    "LearningRate",
+    "Lens",
+    "LevelsOfDetail",
+    "LodBlock",
+    "LodBlocks",
+    "LodInput",
+    "LodTree",
+    "Loss",
+    "Maps",
+    "Mask",
+    "MatchInput",
+    "MatchedADC",
+    "MeanOpacity",
+    "MeanScale",
+    "Measured",
+    "MemoryTaken",
+    "Mesh",
+    "MeshInput",
+    "Mesher",
+    "Method",
+    "MethodInput",
+    "Neighbour",
+    "NewPoints",
+    "NormalConsistency",
+    "Observations",
+    "Partition",
+    "PhotoSkipped",
+    "Pixels",
+    "Plan",
+    "Points",
+    "PointsEdited",
+    "Policy",
+    "Primitive",
+    "Progress",
+    "Prune",
+    "QuantileGrid",
+    "Rasterizer",
+    "Reader",
+    "Recipe",
+    "Reconstruction",
+    "Refine",
+    "Regularizer",
+    "RegularizerInput",
+    "Render",
+    "Reprojection",
+    "Row",
+    "SH_C0",
+    "SIGMOID",
+    "SSIM",
+    "SURFELS",
+    "Scene",
+    "Seen",
+    "Shot",
+    "Signal",
+    "SplatModel",
+    "SplatTable",
+    "Splats",
+    "Split",
+    "Stage",
+    "StageBegan",
+    "StageEnded",
+    "Start",
+    "StartInput",
+    "Step",
+    "StepCount",
+    "StepDone",
+    "Steps",
+    "Stored",
+    "Surfel2D",
+    "TSDF",
+    "Table",
+    "Target",
+    "Tile",
+    "Tracks",
+    "Trust",
+    "View",
+    "Views",
+    "Warned",
+    "WarpedPatches",
+    "admitted",
+    "camera_of",
+    "choice",
+    "components",
+    "dump",
+    "emit",
+    "evolve",
+    "expect",
+    "facing",
+    "find",
+    "graceful",
+    "harmonics",
+    "hookimpl",
+    "isosurface",
+    "leaving_out",
+    "load",
+    "log_linear",
+    "name_of",
+    "read_json",
+    "reject",
+    "replacing",
+    "require_within",
+    "rescale",
+    "rotated",
+    "seeds",
+    "standard_columns",
+    "write_json",
+]
