@@ -89,12 +89,10 @@ def _home(base: type) -> str:
     from surfkit import plugin, testing
     from surfkit.core.registry import kebab
 
-    shown = (
-        f"surfkit.plugin.{base.__name__}" if base.__name__ in plugin.__all__ else f"{base.__module__}.{base.__name__}"
-    )
+    home = "surfkit.plugin" if base.__name__ in plugin.__all__ else base.__module__
     names = (f"check_{kebab(cls.__name__).replace('-', '_')}" for cls in base.__mro__)
     check = next((f", checked by `surfkit.testing.{name}`" for name in names if name in testing.__all__), "")
-    return f"`{shown}`, in `{base.__module__.replace('.', '/')}.py`{check}."
+    return f"`{home}.{base.__name__}`, in `{base.__module__.replace('.', '/')}.py`{check}."
 
 
 def _contract(base: type) -> Iterator[str]:

@@ -36,9 +36,8 @@ def test_recipes(name):
 def test_public_names():
     for name in surfkit.__all__:
         assert getattr(surfkit, name) is not None
-    assert len(set(plugin.__all__)) == len(plugin.__all__) > 100 and all(
-        hasattr(plugin, name) for name in plugin.__all__
-    )
+    assert len(plugin.__all__) > 100 and len(set(plugin.__all__)) == len(plugin.__all__)
+    assert all(hasattr(plugin, name) for name in plugin.__all__)
     with pytest.raises(AttributeError, match="no attribute 'Prunes'"):
         surfkit.Prunes  # noqa: B018
 
