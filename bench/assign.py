@@ -23,7 +23,7 @@ from trained import halfway
 from surfkit.core.tree import evolve
 from surfkit.io.datasets.data import Data
 from surfkit.partition import CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid, SSIMDifference
-from surfkit.study.recipes.city import COARSE
+from surfkit.study.recipes.city import CITY_COARSE
 
 CUTS: dict[str, Partition] = {"contracted 2x2": ContractedGrid((2, 2)), "quantile 3x3": QuantileGrid((3, 3))}
 THRESHOLDS = [at / 1_000 for at in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45, 50, 60, 80, 100, 150)]
@@ -53,8 +53,8 @@ class Case:
 
 def coarse_model(path: Path, steps: int, scale: float) -> CoarseModel:
     """A scene half-way through a training of so many steps, and its views."""
-    losses = {name: loss for name, loss in COARSE.pretrain.losses.items() if name != "depth"}
-    trainer, state = halfway(evolve(COARSE, "pretrain.losses", losses), 2 * steps, Data(path, scale=scale))
+    losses = {name: loss for name, loss in CITY_COARSE.pretrain.losses.items() if name != "depth"}
+    trainer, state = halfway(evolve(CITY_COARSE, "pretrain.losses", losses), 2 * steps, Data(path, scale=scale))
     splats = trainer.primitive.activate(state.points.params, state.sh_degree)
     return CoarseModel(splats, trainer.views, trainer.rasterizer, trainer.stage.near)
 

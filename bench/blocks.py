@@ -24,7 +24,7 @@ from surfkit.core.tree import evolve
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.partition import Balanced, CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid
-from surfkit.partition.plan import Fewest, plan
+from surfkit.partition.plan import BlockMinimums, plan
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.runs.blocks.block import load_blocks
@@ -104,7 +104,7 @@ def main() -> None:
         "balanced 40": Balanced(40, threshold=0.02),
     }
     for name, partition in plans.items():
-        costs = [block.work for block in plan(sight, partition, PictureShare(0.02), Fewest(1, 0, 0)).blocks]
+        costs = [block.work for block in plan(sight, partition, PictureShare(0.02), BlockMinimums(1, 0, 0)).blocks]
         figures[f"{name}: largest against mean"] = max(costs) * len(costs)
         for devices in (1, 2, 4, 8, 16, 32, 64):
             figures[f"{name}: efficiency on {devices}"] = efficiency(costs, devices)

@@ -29,8 +29,8 @@ from surfkit.apps.view.measure import coordinates
 from surfkit.apps.view.page import first_view
 from surfkit.apps.view.screen import WORLD, ray_through
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import Shelf
-from surfkit.apps.view.subject import Points, Subject
+from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.subject import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.select import select
@@ -42,7 +42,7 @@ UP = np.array([0.0, 0.0, 1.0])
 FRAME = Frame(np.array([492_000.0, 5_260_000.0, 430.0]), 0.01, 1.0, "EPSG:32632")
 
 
-def subjects(size: int) -> dict[str, Subject]:
+def subjects(size: int) -> dict[str, ViewerScene]:
     """What is looked at, by name."""
     table = city(size)
     primitive = primitive_of(table)
@@ -54,17 +54,17 @@ def subjects(size: int) -> dict[str, Subject]:
     at = np.arange(side * side, dtype=np.int32).reshape(side, side)
     a, b, c, d = (corner.ravel() for corner in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
     mesh = Mesh(hills, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
-    points = Points(table.means.numpy(), np.zeros((size, 3), np.uint8))
+    points = ViewerPoints(table.means.numpy(), np.zeros((size, 3), np.uint8))
     return {
-        "splats": Subject(Path("city"), FRAME, UP, splats=table, draw=draw),
-        "mesh": Subject(Path("hills"), FRAME, UP, mesh=mesh),
-        "points": Subject(Path("points"), FRAME, UP, points=points),
+        "splats": ViewerScene(Path("city"), FRAME, UP, splats=table, draw=draw),
+        "mesh": ViewerScene(Path("hills"), FRAME, UP, mesh=mesh),
+        "points": ViewerScene(Path("points"), FRAME, UP, points=points),
     }
 
 
-def measured(subject: Subject, count: int) -> dict[str, float]:
+def measured(subject: ViewerScene, count: int) -> dict[str, float]:
     """Milliseconds of a request: CPU time in the middle and at the slow end, and time that passes."""
-    shelf, draw = Shelf(subject), np.random.default_rng(0)
+    shelf, draw = SharedCache(subject), np.random.default_rng(0)
     up, at, middle = first_view(subject)
     ahead = (middle - at) / np.linalg.norm(middle - at)
     right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))

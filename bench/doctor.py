@@ -17,7 +17,7 @@ from pathlib import Path
 from trained import EXAMPLE
 
 from surfkit.apps.doctor.examine import examine
-from surfkit.apps.doctor.forecast import Plan, forecast
+from surfkit.apps.doctor.forecast import ProbePlan, forecast
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.io.datasets.data import Data
@@ -49,8 +49,8 @@ def main() -> None:
     was = answer.get()
     process.join()
     recipe = with_steps(recipes()["2dgs"], asked.steps)
-    free, _ = forecast(data, recipe, examine(data, recipe), Plan())
-    found, _ = forecast(data, recipe, examine(data, recipe), Plan(points=was["points"]))
+    free, _ = forecast(data, recipe, examine(data, recipe), ProbePlan())
+    found, _ = forecast(data, recipe, examine(data, recipe), ProbePlan(points=was["points"]))
     told = {"points": free.points, "seconds": found.seconds, "memory": found.memory_bytes, "disk": found.run_bytes}
     ratios = {key: round(told[key] / was[key], 3) for key in told}
     print(json.dumps({"estimated": told, "was": was, "ratio": ratios}, indent=2))

@@ -25,7 +25,7 @@ from surfkit.evaluate.geometry.scores import nearest, shares, tree
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh, MeshInput
 from surfkit.mesh.clean import clean
 from surfkit.mesh.files import write_mesh
@@ -39,9 +39,9 @@ from surfkit.scene.scene import Frame, Scene, View
 ROWS = {
     "as it is": TSDF(),
     "fewer views needed": TSDF(least_views=0.25),
-    "agreement": TSDF(least_views=0.25, trust=Agreement()),
-    "agreement, what is alone left out": TSDF(least_views=0.25, trust=Agreement(alone=0.0)),
-    "agreement, floaters dropped": TSDF(least_views=0.25, trust=Agreement(), floaters=1.0),
+    "agreement": TSDF(least_views=0.25, trust=GeometricConsistency()),
+    "agreement, what is alone left out": TSDF(least_views=0.25, trust=GeometricConsistency(alone=0.0)),
+    "agreement, floaters dropped": TSDF(least_views=0.25, trust=GeometricConsistency(), floaters=1.0),
 }
 
 

@@ -27,9 +27,9 @@ from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.compress.cuda.codes import sums as gpu_sums
 from surfkit.compress.kmeans import nearest, sums
 from surfkit.depth.cuda.passes import GpuPasses
-from surfkit.depth.native import Grey, Planes, Terms, improve
+from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve
 from surfkit.mesh.cuda.grid import GpuGrid
-from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.mesh.native import grid
 from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import select
@@ -157,11 +157,11 @@ def matching(device: torch.device, rounds: int) -> dict[str, float]:
         pose = pose.clone()
         pose[0, 3] = -0.01 * at
         camera = Camera(pose, 1000.0, 1000.0, SIZE[0] / 2, SIZE[1] / 2, *SIZE)
-        seen.append(Grey(camera, np.roll(value, -10 * at, 1)))
+        seen.append(GreyImage(camera, np.roll(value, -10 * at, 1)))
     planes = Planes.at(draw.uniform(0.5, 1.5, value.shape).astype(np.float32), 16)
     planes.each[:] = draw.integers(0, 256, planes.each.shape)
     known = [torch.full(value.shape, 1.0, device=device)] * 16
-    terms = Terms(0.2, 2, 80, 0.25, 0.015, 0.2, 15, 1.5, samples=32, best=2, window=7, survey=False)
+    terms = MatchingSettings(0.2, 2, 80, 0.25, 0.015, 0.2, 15, 1.5, samples=32, best=2, window=7, survey=False)
     use = GpuPasses(device).improve if device.type == "cuda" else improve
 
     def moved() -> None:
@@ -179,7 +179,7 @@ def fusing(device: torch.device, rounds: int) -> float:
     lattice, pose = Lattice(0.01, 0.04), torch.eye(4, dtype=torch.float64)
     camera = Camera(pose, 1000.0, 1000.0, SIZE[0] / 2, SIZE[1] / 2, *SIZE)
     depth = np.linspace(9, 11, SIZE[0], dtype=np.float32)[None].repeat(SIZE[1], 0)
-    seen = Picture(depth, np.full_like(depth, 32 << 24, np.uint32), camera)
+    seen = FusionImage(depth, np.full_like(depth, 32 << 24, np.uint32), camera)
     into = GpuGrid(lattice, device) if device.type == "cuda" else grid(lattice)
     return milliseconds(lambda: into.fuse(seen, True), rounds, device)
 

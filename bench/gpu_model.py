@@ -25,14 +25,14 @@ from scenes import city
 from surfkit.compress.cuda import codes
 from surfkit.mesh.cuda import grid
 from surfkit.mesh.cuda.grid import GpuGrid
-from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.raster.api import Maps
 from surfkit.raster.cuda import ssim
 from surfkit.raster.cuda.rasterizer import TileRasterizer
 from surfkit.raster.cuda.rasterizer import source as raster_source
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.nvrtc.nvrtc import nvrtc, resources
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.scene.camera import Camera
 from surfkit.train import adam
 
@@ -73,7 +73,7 @@ class Case:
     """A kernel at work: `run` launches it on a few values, `values` of them; `total` is the full size."""
 
     kernel: str
-    source: Source
+    source: CudaSource
     threads: int
     run: Callable[[Emulated], None]
     values: int
@@ -102,7 +102,7 @@ def _fuse(on: Emulated) -> None:
     lattice = Lattice(0.01, 0.04, low=(-4, -4, 12), high=(4, 4, 13))
     camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 48.0, 48.0, 96, 96)
     depth, shade = np.full((96, 96), 1.0, np.float32), np.full((96, 96), 32 << 24, np.uint32)
-    GpuGrid(lattice, on.device, on).fuse(Picture(depth, shade, camera), carve=False)
+    GpuGrid(lattice, on.device, on).fuse(FusionImage(depth, shade, camera), carve=False)
 
 
 def _approach(on: Emulated) -> None:
@@ -115,11 +115,11 @@ WALL = 90_000 * 512  # voxels of the blocks that a view of 1600 x 1200 pixels of
 PAIRS = 400_000 * 8_192  # vectors of 45 numbers, and codes
 SURFELS = 1_000_000 * 58  # degree 3
 CASES = (
-    Case("adam", adam.SOURCE, 256, _adam, 64 * 1024, SURFELS, 28, 30),
-    Case("ssim_forward", ssim.SOURCE, 128, _forward, 128 * 128, IMAGE, 20, 155),
-    Case("ssim_backward", ssim.SOURCE, 128, _backward, 128 * 128, IMAGE, 24, 95),
-    Case("fuse", grid.SOURCE, grid.THREADS, _fuse, 64 * 512, WALL, 14, 120),
-    Case("approach", codes.SOURCE, 256, _approach, 128 * 64, PAIRS, 0, 2 * 48),
+    Case("adam", adam.ADAM_SOURCE, 256, _adam, 64 * 1024, SURFELS, 28, 30),
+    Case("ssim_forward", ssim.SSIM_SOURCE, 128, _forward, 128 * 128, IMAGE, 20, 155),
+    Case("ssim_backward", ssim.SSIM_SOURCE, 128, _backward, 128 * 128, IMAGE, 24, 95),
+    Case("fuse", grid.FUSION_SOURCE, grid.THREADS_PER_BLOCK, _fuse, 64 * 512, WALL, 14, 120),
+    Case("approach", codes.CODES_SOURCE, 256, _approach, 128 * 64, PAIRS, 0, 2 * 48),
 )
 
 
@@ -155,7 +155,7 @@ SLOW = {"div": 10, "rcp": 6, "sqrt": 10}
 class Noted:
     """Kernels of the rasterizer, emulated; notes what their launches did, by kernel."""
 
-    def __init__(self, source: Source, launches: dict[str, Launch]) -> None:
+    def __init__(self, source: CudaSource, launches: dict[str, Launch]) -> None:
         self.source, self.launches, self.on = source, launches, Emulated(source)
 
     def launch(self, name: str, grid: int, block: int, *arguments: object) -> None:
@@ -170,7 +170,7 @@ class Noted:
 class Launch:
     """What a launch did; `memory` is each of its tensors once."""
 
-    source: Source
+    source: CudaSource
     kernel: str
     threads: int
     blocks: int

@@ -29,8 +29,8 @@ from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from surfkit.apps.maps.contours import contour_lines, even_interval
-from surfkit.apps.maps.grid import Grid, Window
-from surfkit.apps.maps.ours import RECORD
+from surfkit.apps.maps.grid import MapGrid, Window
+from surfkit.apps.maps.ours import MAPS_RECORD
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.evaluate.geometry.surface import read_surface
@@ -48,15 +48,15 @@ POINTS = 1 << 20
 """That are projected at once."""
 
 
-def read_grid(maps: Path) -> Grid:
+def read_grid(maps: Path) -> MapGrid:
     """The cells of maps that surfkit drew.
 
     Raises:
         BadInput: There are none.
     """
-    record = read_json(maps / RECORD, dict[str, Any])
+    record = read_json(maps / MAPS_RECORD, dict[str, Any])
     gsd, (west, _, _, north), size = record["gsd"], record["bounds"], record["size"]
-    return Grid(np.array(record["axes"]), gsd, round(west / gsd), round(north / gsd), *size)
+    return MapGrid(np.array(record["axes"]), gsd, round(west / gsd), round(north / gsd), *size)
 
 
 def outline_of(covered: np.ndarray, radius: int = CLOSED) -> np.ndarray:
@@ -101,7 +101,7 @@ def times_seen(points: np.ndarray, views: Sequence[View], frame: Frame) -> np.nd
     return found
 
 
-def cell_places(grid: Grid, heights: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def cell_places(grid: MapGrid, heights: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """(n, 3) float64 centres, in the frame of the input, of (n, 2) rows and columns of a map with its heights."""
     row, column = cells.T
     east, north = (grid.west + column + 0.5) * grid.gsd, (grid.north - row - 0.5) * grid.gsd
@@ -109,7 +109,7 @@ def cell_places(grid: Grid, heights: np.ndarray, cells: np.ndarray) -> np.ndarra
 
 
 def map_holes(
-    heights: np.ndarray, colored: np.ndarray, grid: Grid, views: Sequence[View], frame: Frame
+    heights: np.ndarray, colored: np.ndarray, grid: MapGrid, views: Sequence[View], frame: Frame
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Figures of the maps, and (H, W) bool of their outline.
 
@@ -129,7 +129,7 @@ def map_holes(
     return {"cells": len(cells), "seen": len(row), "cell": grid.gsd, **shares}, outline
 
 
-def mesh_holes(path: Path, grid: Grid, outline: np.ndarray, views: Sequence[View], frame: Frame) -> dict[str, Any]:
+def mesh_holes(path: Path, grid: MapGrid, outline: np.ndarray, views: Sequence[View], frame: Frame) -> dict[str, Any]:
     """Figures of the edges of a mesh that have one triangle."""
     surface = read_surface(path)
     mesh = whole_mesh(surface)
@@ -144,9 +144,9 @@ def mesh_holes(path: Path, grid: Grid, outline: np.ndarray, views: Sequence[View
     return {"edges": all_edges, "boundary": len(edges), "away_from_rim": count, "share": count / all_edges}
 
 
-def contour_pieces(heights: np.ndarray, grid: Grid, maps: Path) -> dict[str, Any]:
+def contour_pieces(heights: np.ndarray, grid: MapGrid, maps: Path) -> dict[str, Any]:
     """Pieces of contour lines of the whole map, and in the file, if there is one."""
-    record = read_json(maps / RECORD, dict[str, Any]).get("contours")
+    record = read_json(maps / MAPS_RECORD, dict[str, Any]).get("contours")
     known = heights[np.isfinite(heights)]
     interval = record["interval"] if record else even_interval(known.min(), known.max())
     lines = contour_lines(heights, grid, Window(0, 0, grid.width, grid.height), interval)

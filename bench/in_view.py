@@ -20,7 +20,7 @@ from surfkit.raster.select import select
 from surfkit.scene.photos import view_photo
 from surfkit.study.recipes import RECIPES
 from surfkit.train import checkpoint
-from surfkit.train.in_view import InView
+from surfkit.train.in_view import PointsInView
 from surfkit.train.trainer import Trainer
 
 
@@ -49,7 +49,9 @@ def main() -> None:
             began = time.process_time()
             done = trainer.step(state)
             times[name] += [time.process_time() - began] * (index >= 3)
-        shares.append(float(InView.of_step(trainer, state, done.target.view.camera).rows.numel() / len(state.points)))
+        shares.append(
+            float(PointsInView.of_step(trainer, state, done.target.view.camera).rows.numel() / len(state.points))
+        )
     taken = {name: torch.tensor(each) for name, each in times.items()}
     figures = {
         "points": len(state.points),

@@ -28,7 +28,7 @@ from machine import save
 sys.path += [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parents[1] / "tests" / "apps" / "view")]
 from browser import Browser
 
-from surfkit.apps.view.control import Control
+from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.live import Live, live_view
 from surfkit.apps.view.server import Address
 from surfkit.cli.recipes import recipes
@@ -38,9 +38,9 @@ from surfkit.runs.blocks.schedule import Compute
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.runs.stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.progress import Display
+from surfkit.train.progress import TrainingDisplay
 from surfkit.train.state import StageState
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 
 WAYS = ("no page", "nobody looks", "somebody looks")
@@ -126,8 +126,8 @@ class Somebody:
 
 def watching(stage: Watched, steps: int = 20_000) -> float:
     """Seconds of a step that the loop of the training takes for a page without a browser."""
-    clock = Stopwatch(StageState(Points.fresh({}, {}), Order(1), torch.Generator()))
-    display, control = Display("bench", steps), Control()
+    clock = Stopwatch(StageState(Points.fresh({}, {}), ViewOrder(1), torch.Generator()))
+    display, control = TrainingDisplay("bench", steps), TrainingControl()
     began = time.perf_counter()
     with watched_by(control), watched(stage) as look:
         for index in range(steps):

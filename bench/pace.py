@@ -26,7 +26,7 @@ from view import QUIET, RENDERER, SIZE, SOFTWARE, city
 
 from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import Points, Subject
+from surfkit.apps.view.subject import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
 
@@ -48,7 +48,7 @@ SPEED = 40.0
 """Of the mouse, pixels a second."""
 
 
-def subjects(size: int) -> dict[str, Subject]:
+def subjects(size: int) -> dict[str, ViewerScene]:
     """What is looked at, by name."""
     table, frame, up = city(size), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0])
     rgb = (0.5 + 0.28 * table.sh0).clamp(0, 1).mul(255).byte().numpy()
@@ -60,9 +60,9 @@ def subjects(size: int) -> dict[str, Subject]:
     faces, shade = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), 128 + 900 * hills[:, 2:]
     mesh = Mesh(hills, faces, np.repeat(shade, 3, axis=1).astype(np.uint8))
     return {
-        "splats": Subject(Path("city"), frame, up, splats=table),
-        "points": Subject(Path("city"), frame, up, points=Points(table.means.numpy(), rgb)),
-        "mesh": Subject(Path("hills"), frame, up, mesh=mesh),
+        "splats": ViewerScene(Path("city"), frame, up, splats=table),
+        "points": ViewerScene(Path("city"), frame, up, points=ViewerPoints(table.means.numpy(), rgb)),
+        "mesh": ViewerScene(Path("hills"), frame, up, mesh=mesh),
     }
 
 

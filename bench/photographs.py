@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher
-from surfkit.apps.sfm.prepare import Preparation
+from surfkit.apps.sfm.prepare import SfmPreparation
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.core.registry import find
@@ -84,7 +84,7 @@ def main() -> None:
             mapper=given.mapper,
         )
         with collect_notes():
-            report = Preparation(photos, work / "scene", settings).run()
+            report = SfmPreparation(photos, work / "scene", settings).run()
         spent = time.perf_counter() - began, time.process_time() - cpu
         found = centres(work / "scene")
     names = sorted(found)

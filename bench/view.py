@@ -25,8 +25,8 @@ from machine import save
 
 from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import FORMS, MOST
-from surfkit.apps.view.subject import Subject
+from surfkit.apps.view.shelf import DEFAULT_BUDGET, SPLAT_FORMS
+from surfkit.apps.view.subject import ViewerScene
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.io.splats.table import SplatTable
@@ -119,7 +119,7 @@ def measured(browser: Any, url: str, form: str, budget: int, asked: argparse.Nam
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--splats", type=int, default=3_000_000)
-    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, MOST, 200_000])
+    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, DEFAULT_BUDGET, 200_000])
     parser.add_argument("--seconds", type=float, default=30.0, help="of turning, for each budget")
     parser.add_argument("--patience", type=float, default=300.0, help="seconds to wait for the first frame")
     parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("google-chrome"))
@@ -134,11 +134,11 @@ def main() -> int:
     if not asked.chromium:
         print("bench/view.py needs a Chromium; name one with --chromium", file=sys.stderr)
         return 2
-    subject = Subject(Path("city"), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0]), splats=city(asked.splats))
+    subject = ViewerScene(Path("city"), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0]), splats=city(asked.splats))
     rows = []
     arguments = [*QUIET, *([] if asked.gpu else SOFTWARE)]
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
-        for form, budget in product(FORMS, sorted(asked.budgets)):
+        for form, budget in product(SPLAT_FORMS, sorted(asked.budgets)):
             browser = play.chromium.launch(executable_path=asked.chromium, args=arguments)
             with served(Address(), "bench") as page:
                 show(subject, page, Path(folder), budget, form)

@@ -37,7 +37,7 @@ from surfkit.densify import ADC, AbsGradient, CountCap, MatchedADC
 from surfkit.densify.base import Contribution, Densify, Filter, Policy, Prune, Signal, Step, Views, admitted
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, camera_of
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
@@ -79,9 +79,9 @@ from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.camera import Camera
-from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.pixels import Pixels
-from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
+from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
@@ -98,9 +98,9 @@ __all__ = [
     "AutogradRender",
     "BadInput",
     "Camera",
-    "Capture",
+    "RawDataset",
     "Cells",
-    "Cloud",
+    "SparsePoints",
     "CoarseModel",
     "Column",
     "ColumnType",
@@ -201,8 +201,8 @@ __all__ = [
     "SSIM",
     "SURFELS",
     "Scene",
-    "Seen",
-    "Shot",
+    "Observations2D",
+    "RawImage",
     "Signal",
     "SplatModel",
     "SplatTable",

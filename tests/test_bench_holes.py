@@ -9,14 +9,14 @@ import torch
 from needs import needs
 from pages import ROOT
 
-from surfkit.apps.maps.grid import Grid
+from surfkit.apps.maps.grid import MapGrid
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
 rasterio = needs("rasterio")
 trimesh = needs("trimesh")
-GRID = Grid(np.eye(3), 0.5, -100, 80, 200, 160)
+GRID = MapGrid(np.eye(3), 0.5, -100, 80, 200, 160)
 """100 m by 80 m from x = -50 to 50 and from y = -40 to 40."""
 
 
@@ -78,8 +78,8 @@ def test_heights_of_holes_are_linear_between_the_cells_around(holes):
 
 
 def test_cells_have_their_places(holes):
-    """Back by `Grid.to_cells`, of a frame with y up."""
-    turned = Grid(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), 0.25, -3, 7, 9, 8)
+    """Back by `MapGrid.to_cells`, of a frame with y up."""
+    turned = MapGrid(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), 0.25, -3, 7, 9, 8)
     cells = np.argwhere(np.ones((8, 9), bool))
     places = turned.to_cells(holes.cell_places(turned, np.arange(72.0).reshape(8, 9), cells))
     assert np.allclose(places, np.column_stack([cells[:, 1] + 0.5, cells[:, 0] + 0.5, np.arange(72)]))

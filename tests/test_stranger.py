@@ -128,13 +128,13 @@ def test_a_run_of_all_of_them(finished):
 def test_an_interrupted_run_comes_to_the_same(train, finished, tmp_path, monkeypatch):
     """Stopped after three steps, between two edits: what the densifier has summed up is kept."""
 
-    class Interrupting(stage.Display):
+    class Interrupting(stage.TrainingDisplay):
         def show(self, done):
             if done.index == 3:
                 os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "Display", Interrupting)
+        patch.setattr(stage, "TrainingDisplay", Interrupting)
         train(tmp_path / "run", *WORDS.values(), status=130)
     assert state_of(tmp_path / "run").index == 3
     resumed, whole = state_of(train(tmp_path / "run", *WORDS.values())), state_of(finished)

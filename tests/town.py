@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
-from surfkit.testing.synthetic import Box, Ground
+from surfkit.testing.synthetic import Box, GroundPlane
 
 HALF = 6.0
 BOX = Box((-2.0, -1.5, 0.0), (1.0, 1.5, 2.5))
@@ -57,7 +57,7 @@ def photo_of(pose, camera, with_car):
     """(H, W, 3) colours in [0, 1]; beyond the square there is nothing, black."""
     rays = camera.rays(torch.float64).flatten(1).T.numpy() @ pose[:3, :3]
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    far, which = seen_from(eye, rays, [Ground(), BOX, *([CAR] if with_car else [])])
+    far, which = seen_from(eye, rays, [GroundPlane(), BOX, *([CAR] if with_car else [])])
     places = eye + np.where(np.isfinite(far), far, 0)[:, None] * rays
     color = truth(places, which == 1)
     color[which == 2] = YELLOW
@@ -67,7 +67,7 @@ def photo_of(pose, camera, with_car):
 
 @dataclass(frozen=True)
 class Town:
-    surface: Surface
+    surface: SurfaceFile
     frame: Frame
     views: tuple[View, ...]
 
@@ -115,7 +115,7 @@ def surface(cell, move=(0.0, 0.0, 0.0)):
     rows["x"], rows["y"], rows["z"] = (np.concatenate([places for places, _ in sheets]) + move).T
     rows["red"], rows["green"], rows["blue"] = HIDDEN
     faces = np.concatenate([part + start for (_, part), start in zip(sheets, starts, strict=False)])
-    return Surface("mesh.ply", rows, faces.astype(np.int32))
+    return SurfaceFile("mesh.ply", rows, faces.astype(np.int32))
 
 
 def is_seen(places, only=range(12)):
@@ -125,7 +125,7 @@ def is_seen(places, only=range(12)):
         if at not in only:
             continue
         eye = -pose[:3, :3].T @ pose[:3, 3]
-        far, _ = seen_from(eye, places - eye, [Ground(), BOX])
+        far, _ = seen_from(eye, places - eye, [GroundPlane(), BOX])
         local = places @ pose[:3, :3].T + pose[:3, 3]
         x = 150.0 * local[:, 0] / local[:, 2] + 0.52 * WIDTH
         y = 151.0 * local[:, 1] / local[:, 2] + 0.49 * HEIGHT

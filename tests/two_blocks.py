@@ -18,7 +18,7 @@ from surfkit.runs.recipe import Recipe
 from surfkit.runs.stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.progress import Display
+from surfkit.train.progress import TrainingDisplay
 from surfkit.train.stage import Stage
 
 STEPS = 12
@@ -77,7 +77,7 @@ def await_sigterm(reached: Path) -> None:
 def stop_after(optimise, step):
     """An `optimise` during which SIGINT comes after a step."""
 
-    class Interrupting(Display):
+    class Interrupting(TrainingDisplay):
         def show(self, done):
             super().show(done)
             if done.index == step:
@@ -85,7 +85,7 @@ def stop_after(optimise, step):
 
     def stopping(job, state):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("surfkit.runs.stage.Display", Interrupting)
+            patch.setattr("surfkit.runs.stage.TrainingDisplay", Interrupting)
             return optimise(job, state)
 
     return stopping

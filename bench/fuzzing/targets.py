@@ -45,18 +45,18 @@ def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     from surfkit.runs import stage
 
     colmap(here)
-    display = stage.Display
+    display = stage.TrainingDisplay
 
     class Stopping(display):
         def show(self, done: Any) -> None:
             if self.stage == stop:
                 os.kill(os.getpid(), signal.SIGTERM)
 
-    stage.Display = Stopping
+    stage.TrainingDisplay = Stopping
     try:
         status = main(words.replace("--steps 2", "--steps 2 --checkpoint-every 1").format(here=here).split())
     finally:
-        stage.Display = display
+        stage.TrainingDisplay = display
     assert status == (130 if stop else 0), status
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from surfkit.api.dataset import Dataset, read
 from surfkit.api.listen import OnStep, listening
-from surfkit.api.results import Figures, Mesh
+from surfkit.api.results import Figures, RunMesh
 from surfkit.api.run import TrainedRun, open_run
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -23,7 +23,7 @@ from surfkit.runs.recipe import Recipe, complete
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 
-__all__ = ["Dataset", "Figures", "Mesh", "OnStep", "TrainedRun", "get_recipe", "open_run", "read", "train"]
+__all__ = ["Dataset", "Figures", "OnStep", "RunMesh", "TrainedRun", "get_recipe", "open_run", "read", "train"]
 
 
 def get_recipe(name: str | Path | Recipe) -> Recipe:

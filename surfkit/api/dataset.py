@@ -13,7 +13,7 @@ import torch
 from surfkit.api.listen import heard
 from surfkit.core.check import BadInput
 from surfkit.core.registry import unknown
-from surfkit.io.datasets.data import Data, Reading
+from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.io.datasets.read import read as read_scene
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, Scene, View
@@ -95,17 +95,17 @@ def read(path: str | Path, **options: Any) -> Dataset:
     Args:
         path: Folder of the data set.
         options: As on the command line, with underscores: `scale=4`, `longest=1600`, `test_every=8`, `masks=...`; see
-            `surfkit.io.datasets.data.Reading`.
+            `surfkit.io.datasets.data.ReadSettings`.
 
     Raises:
         BadInput: Something is missing, damaged or not supported.
     """
-    known = [each.name for each in fields(Reading)]
+    known = [each.name for each in fields(ReadSettings)]
     for name in options:
         if name not in known:
             raise BadInput(f"read: {unknown('option', name, known)}")
     options = {name: Path(it) if isinstance(it, str) and name in PATHS else it for name, it in options.items()}
-    data = Reading(**options).of(Path(path))
+    data = ReadSettings(**options).of(Path(path))
     with heard() as texts:
         return Dataset(data, read_scene(data), tuple(texts))
 

@@ -18,7 +18,7 @@ from surfkit.scene.scene import Frame
 
 
 @dataclass(frozen=True)
-class Mesh:
+class RunMesh:
     """Triangles in the frame of the input.
 
     Attributes:
@@ -36,13 +36,13 @@ class Mesh:
     path: Path | None = None
 
     @staticmethod
-    def read(path: Path) -> Mesh:
+    def read(path: Path) -> RunMesh:
         """The mesh in a file."""
         found = read_surface(path)
         names = found.rows.dtype.names or ()
         colors = [found.rows[name] for name in ("red", "green", "blue") if name in names]
         values = {name: np.asarray(found.rows[name]) for name in VALUES if name in names}
-        return Mesh(found.vertices(), found.faces, np.stack(colors, 1) if colors else None, values, path)
+        return RunMesh(found.vertices(), found.faces, np.stack(colors, 1) if colors else None, values, path)
 
     def save(self, path: str | Path) -> Path:
         """Write it as .ply, .obj or .glb."""

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from surfkit.api.dataset import Dataset
-from surfkit.api.results import Figures, Mesh
+from surfkit.api.results import Figures, RunMesh
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.lock import locked
@@ -129,7 +129,7 @@ class TrainedRun:
         with torch.no_grad():
             return made.draw(view)
 
-    def mesh(self, mesher: str | Mesher | None = None, *, memory: str = "auto", **settings: Any) -> Mesh:
+    def mesh(self, mesher: str | Mesher | None = None, *, memory: str = "auto", **settings: Any) -> RunMesh:
         """Make the mesh again, write it to the run folder as `surfkit mesh` does, and return it.
 
         Args:
@@ -165,7 +165,7 @@ class TrainedRun:
         ):
             what = mesh_input(with_maps, made, scene, ctx.rasterizer, budget, chosen)
             record = make_mesh(with_maps, chosen or made.mesh, output, what, made.last_steps)
-        return Mesh.read(run.out / record["files"][0])
+        return RunMesh.read(run.out / record["files"][0])
 
     def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:
         """Measure: on the held-out photographs, or the run's mesh against the truth.

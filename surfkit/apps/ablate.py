@@ -16,22 +16,22 @@ from surfkit.cli.tables import chosen_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.registry import choice
-from surfkit.io.datasets.data import Reading
+from surfkit.io.datasets.data import ReadSettings
 from surfkit.raster.select import Device
 from surfkit.runs.execute.base import Executor, Inline
 from surfkit.study.ablation import Table
 from surfkit.study.notes import lines_on_depth, row_numbers
 from surfkit.study.others import OtherMesh
 from surfkit.study.rows import Trial
-from surfkit.study.screen import Screen
+from surfkit.study.screen import AblationScreen
 from surfkit.study.sharing import sharing_lines
-from surfkit.study.study import FORMS, Plan, ablate, mesh_alone, report_so_far, trials
+from surfkit.study.study import TABLE_WRITERS, AblationPlan, ablate, mesh_alone, report_so_far, trials
 from surfkit.study.table import LEGEND, STACKED, drawing, failures, lines
 from surfkit.study.truth import Truth
 
 
 @dataclass(frozen=True)
-class Ablate:
+class AblateCommand:
     """Train every row of an ablation table on the same data, and compare each row with the one it is built on.
 
     The table is table:NAME (`surfkit tables`), or one of your own: FILE.json, or FILE.py that defines TABLE; if none is
@@ -47,7 +47,7 @@ class Ablate:
     data: tuple[Path, ...]
     """One data set or more; every row is trained on each, and the results stand side by side."""
 
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    reading: Annotated[ReadSettings, tyro.conf.arg(name="")] = ReadSettings()
     """How the data sets are read."""
 
     steps: int | None = None
@@ -110,7 +110,7 @@ class Ablate:
         data = tuple(self.reading.of(path) for path in self.data)
         names = "-".join(path.resolve().name for path in self.data)
         out = self.out or Path("runs") / f"{names}-ablate-{self.table.name}"
-        plan = Plan(
+        plan = AblationPlan(
             self.table,
             data,
             out,
@@ -129,14 +129,17 @@ class Ablate:
             show(report_so_far(plan))
             return 0
         try:
-            with Screen() as screen:
+            with AblationScreen() as screen:
                 report = ablate(plan, screen, self.before)
         except KeyboardInterrupt:
             say(f"{out} keeps what is finished; give the same command again to continue")
             raise
         show(report)
         print()
-        written = [("results", out / "ablation.json"), *(("table", out / f"ablation.{ending}") for ending in FORMS)]
+        written = [
+            ("results", out / "ablation.json"),
+            *(("table", out / f"ablation.{ending}") for ending in TABLE_WRITERS),
+        ]
         written.append(("runs", out / "runs"))
         print_table(("written", "path"), [(what, str(path)) for what, path in written])
         broken = failures(report)
@@ -144,7 +147,7 @@ class Ablate:
             say(f"surfkit: {line}")
         return 1 if broken else 0
 
-    def before(self, plan: Plan, left: Sequence[Trial]) -> None:
+    def before(self, plan: AblationPlan, left: Sequence[Trial]) -> None:
         """Say what is known before the first run: which rows lack depth maps or are passed over, time and disk."""
         folders, labels = {trial.folder for trial in left}, [row.label for row in self.table.rows]
         for line in lines_on_depth([trial for trial in trials(plan) if trial.folder in folders], labels):
@@ -185,4 +188,4 @@ def show(report: dict[str, Any]) -> None:
         say(line)
 
 
-COMMAND = Ablate
+COMMAND = AblateCommand

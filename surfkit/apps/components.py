@@ -14,7 +14,7 @@ from surfkit.core.registry import Component, kind_of, offered, records, unknown
 
 
 @dataclass(frozen=True)
-class Components:
+class ComponentsCommand:
     """List the components that recipes are made of, by kind."""
 
     kind: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="KIND")] = None
@@ -38,7 +38,7 @@ class Components:
         print_failures()
 
 
-COMMAND = Components
+COMMAND = ComponentsCommand
 
 
 def owner_of() -> dict[type[Component], str]:

@@ -22,7 +22,7 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice, name_of
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.raster.select import Device
-from surfkit.runs.compress import Target, compress_run, fitted, size_with, writing
+from surfkit.runs.compress import CompressionTarget, compress_run, fitted, size_with, writing
 from surfkit.runs.folder import Run
 from surfkit.runs.journal import record_events
 from surfkit.runs.measure import measure_compressed
@@ -34,7 +34,7 @@ from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
-class Compress:
+class CompressCommand:
     """Compress the model of a finished run into RUN/compressed/model.surfkit, and measure it; or a file of splats.
 
     Settings that are not given are those of the run's recipe. Example: `surfkit compress RUN compress:packed
@@ -76,7 +76,7 @@ class Compress:
 
     def run(self) -> None:
         """Compress, measure, and print the results."""
-        wanted = Target(
+        wanted = CompressionTarget(
             None if self.target_size is None else size_of(self.target_size),
             None if self.target_loss is None else decibels(self.target_loss),
         )
@@ -86,7 +86,7 @@ class Compress:
             else:
                 self._file(wanted)
 
-    def _run(self, wanted: Target) -> None:
+    def _run(self, wanted: CompressionTarget) -> None:
         if self.axes != "auto":
             raise BadInput(f"--axes {self.axes}: {self.target} is a run, whose axes are known; leave --axes out")
         if self.out is not None:
@@ -104,7 +104,7 @@ class Compress:
             compared = f"{share:.1f} times smaller" if share > 1 else f"{1 / share:.1f} times larger"
             print(f"\nWith compress:{name_of(other)} it would be about {size / 1e6:.2f} MB, {compared}.")
 
-    def _file(self, wanted: Target) -> None:
+    def _file(self, wanted: CompressionTarget) -> None:
         if wanted.decibels is not None:
             raise BadInput("--target-loss needs a run, whose photographs tell what is lost; use --target-size")
         model, frame = model_of_file(self.target, self.axes)
@@ -156,4 +156,4 @@ def show(run: Run, record: dict[str, Any], metrics: dict[str, Any] | None) -> No
     print_table(("written",), [(str(path),) for path in paths])
 
 
-COMMAND = Compress
+COMMAND = CompressCommand

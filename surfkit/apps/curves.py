@@ -11,13 +11,13 @@ import tyro
 from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.chart import write_lines
-from surfkit.study.curves import Place, What, lines
+from surfkit.study.curves import StageRef, What, lines
 
 TITLES = {"points": "points", "loss": "sum of the weighted losses", "memory": "most memory held so far, GB"}
 
 
 @dataclass(frozen=True)
-class Curves:
+class CurvesCommand:
     """Draw a chart of the points, the loss or the memory of runs over the steps.
 
     Example: the number of points while a block is trained, with and without a filter (CityGaussianV2, figure 3).
@@ -42,8 +42,8 @@ class Curves:
         """Draw, and print the first, highest and last value of each line."""
         if self.block is not None and self.refinement is not None:
             raise BadInput("--block and --refinement: give one of them")
-        place = None if self.block is None else Place("block", self.block)
-        place = place if self.refinement is None else Place("refinement", self.refinement)
+        place = None if self.block is None else StageRef("block", self.block)
+        place = place if self.refinement is None else StageRef("refinement", self.refinement)
         found = lines(self.run_folders, self.of, place)
         where = f" of {place.kind} {place.index}" if place else ""
         write_lines(self.out, found, TITLES[self.of] + where, "steps")
@@ -53,4 +53,4 @@ class Curves:
         tell(f"wrote {self.out}")
 
 
-COMMAND = Curves
+COMMAND = CurvesCommand

@@ -17,7 +17,7 @@ from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
 from surfkit.evaluate.mesh.measure import measure_mesh
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
@@ -40,7 +40,7 @@ from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class EvaluateCommand:
     """Measure a finished run on its held-out photographs, or with --gt its mesh against ground truth.
 
     Without --gt: computes PSNR, SSIM and LPIPS, and writes metrics.json and the pictures again. With --gt: computes
@@ -219,7 +219,7 @@ class Evaluate:
             note_compressed(run, metrics)
         show_geometry(out, measured, images)
 
-    def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
+    def _zones(self, zones: Zones, truth: SurfaceFile | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
         with locked(self.target), full_disk_in_one_line(self.target):
             with loaded(self.target, self.device) as (ctx, made):
@@ -241,10 +241,10 @@ class Evaluate:
         return read(Data(self.views))
 
 
-def mesh_alone(surface: Surface, scene: Scene | None) -> dict[str, Any]:
+def mesh_alone(surface: SurfaceFile, scene: Scene | None) -> dict[str, Any]:
     """What metrics.json is to say of a mesh by itself; nothing of a cloud."""
     metres = None if scene is None else scene.frame.metres
     return {} if surface.faces is None else {"mesh": measure_mesh(surface, metres).figures}
 
 
-COMMAND = Evaluate
+COMMAND = EvaluateCommand

@@ -22,7 +22,7 @@ from surfkit.core.registry import choice, name_of
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.files import format_for, format_of, has_suffix, read_splat_file
-from surfkit.io.splats.page import Page
+from surfkit.io.splats.page import HtmlPageFormat
 from surfkit.io.splats.ply import PLY
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.io.splats.tiles3d import Tiles3D
@@ -49,7 +49,7 @@ def named_format() -> Format:
 
 
 @dataclass(frozen=True)
-class Export:
+class ExportCommand:
     """Write the splats of a finished run, or of a file of another program, in a format that viewers open.
 
     Coordinates are those of the data set. Examples: `surfkit export RUN --out scene.spz`, `surfkit export RUN --out
@@ -92,7 +92,7 @@ class Export:
         form, path = self._format(), self._path()
         with collect_notes(), self._opened() as (table, frame, tree, scene), full_disk_in_one_line(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-            if isinstance(form, Page) and scene is not None:
+            if isinstance(form, HtmlPageFormat) and scene is not None:
                 form.write_seen(path, table, frame, scene.train, up_of(scene))
             else:
                 form.write(path, table, frame, tree)
@@ -100,7 +100,7 @@ class Export:
         told = form.rounding(table)
         tell(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
         has_place = isinstance(form, Tiles3D) and form.georeference and frame.crs
-        if any(frame.shift) and not (has_place or isinstance(form, Page)):
+        if any(frame.shift) and not (has_place or isinstance(form, HtmlPageFormat)):
             tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
@@ -166,4 +166,4 @@ def _size(path: Path) -> str:
     return size(count) if count >= 1e7 else f"{count / 1e6:.2g} MB"
 
 
-COMMAND = Export
+COMMAND = ExportCommand

@@ -7,16 +7,16 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from surfkit.apps.doctor.estimate import Estimate, duration
+from surfkit.apps.doctor.estimate import ResourceEstimate, duration
 from surfkit.apps.doctor.examine import examine
-from surfkit.apps.doctor.forecast import Plan as Probe
+from surfkit.apps.doctor.forecast import ProbePlan as Probe
 from surfkit.apps.doctor.forecast import forecast
 from surfkit.core.events import say
 from surfkit.core.memory import size
 from surfkit.runs.recipe import Recipe
 from surfkit.study.rows import Trial
 from surfkit.study.sharing import Key, finished_keys, keys_of
-from surfkit.study.study import Plan, trials
+from surfkit.study.study import AblationPlan, trials
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Needs:
     stages: int
 
 
-def foretell(plan: Plan, left: Sequence[Trial], probe_steps: int) -> None:
+def foretell(plan: AblationPlan, left: Sequence[Trial], probe_steps: int) -> None:
     """Print what the trials that are left of a table will take in time and disk, in a line or two for each data set."""
     done = finished_keys(trials(plan)) if plan.shared else set()
     for data, _ in plan.sets:
@@ -59,7 +59,7 @@ def foretell(plan: Plan, left: Sequence[Trial], probe_steps: int) -> None:
             say(f"forecast: {line}")
 
 
-def lines(plan: Plan, name: str, needs: Needs, recipe: Recipe, found: Estimate) -> Iterator[str]:
+def lines(plan: AblationPlan, name: str, needs: Needs, recipe: Recipe, found: ResourceEstimate) -> Iterator[str]:
     """The forecast for one data set in words.
 
     Args:

@@ -10,7 +10,7 @@ import tyro
 
 from surfkit.apps.result import show
 from surfkit.core.registry import choice
-from surfkit.io.datasets.data import Reading
+from surfkit.io.datasets.data import ReadSettings
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model
 from surfkit.mesh.base import Mesher
@@ -25,7 +25,7 @@ from surfkit.train.data_cache import CacheSettings
 
 
 @dataclass(frozen=True)
-class Import:
+class ImportCommand:
     """Take splats from a file of any program into a run folder, and measure and mesh them on the photographs.
 
     Nothing is optimised. `surfkit evaluate`, `mesh` and `export` work on the folder, and `surfkit train recipe:2dgs
@@ -50,7 +50,7 @@ class Import:
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = field(default_factory=TSDF)
     """How the splats become triangles; none for no mesh."""
 
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    reading: Annotated[ReadSettings, tyro.conf.arg(name="")] = ReadSettings()
     """How the data set is read."""
 
     device: Device = "auto"
@@ -69,4 +69,4 @@ class Import:
         show(Run(out, recipe, data), metrics)
 
 
-COMMAND = Import
+COMMAND = ImportCommand

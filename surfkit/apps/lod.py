@@ -29,7 +29,7 @@ from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
-class LodOf:
+class LodCommand:
     """Make levels of detail of a finished run, or make them again with other settings; writes the folder RUN/lod.
 
     Settings that are not given are those of the run's recipe. Example: `surfkit lod RUN lod:merge --lod.steps 100`.
@@ -77,4 +77,4 @@ def show(run: Run, record: dict[str, Any]) -> None:
     print_table(("written",), [(str(path),) for path in paths])
 
 
-COMMAND = LodOf
+COMMAND = LodCommand

@@ -34,7 +34,7 @@ from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
-class MeshOf:
+class MeshCommand:
     """Make the mesh of a finished run, or make it again with other settings; writes mesh.ply, mesh.json and pictures.
 
     Settings that are not given are those of the run's recipe. Example: `surfkit mesh RUN mesh:tsdf --mesh.voxel 0.5`.
@@ -106,4 +106,4 @@ def show(run: Run, record: dict[str, Any]) -> None:
     print_table(("written", "path"), [(what, str(path)) for what, path in paths])
 
 
-COMMAND = MeshOf
+COMMAND = MeshCommand

@@ -9,7 +9,7 @@ from surfkit.core.registry import Plugin, offered, records
 
 
 @dataclass(frozen=True)
-class Plugins:
+class PluginsCommand:
     """List the plugins: package, components, and the error if one does not load.
 
     The environment variable SURFKIT_PLUGINS limits which are used: "none", or names separated by commas.
@@ -34,7 +34,7 @@ class Plugins:
         print_table(("plugin", "package", "version", "offers"), rows, errors=failed)
 
 
-COMMAND = Plugins
+COMMAND = PluginsCommand
 
 
 def _offers_text(plugin: Plugin, offers: list[str]) -> str:

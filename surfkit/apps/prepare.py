@@ -1,7 +1,7 @@
 """`surfkit prepare`: what photographs or a data set may need before training."""
 
-from surfkit.apps.prepare_depth import Depth
-from surfkit.apps.prepare_photos import Photos
-from surfkit.apps.prepare_points import Points
+from surfkit.apps.prepare_depth import PrepareDepthCommand
+from surfkit.apps.prepare_photos import PreparePhotosCommand
+from surfkit.apps.prepare_points import PreparePointsCommand
 
-COMMAND = {"photos": Photos, "points": Points, "depth": Depth}
+COMMAND = {"photos": PreparePhotosCommand, "points": PreparePointsCommand, "depth": PrepareDepthCommand}

@@ -20,10 +20,10 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared
+from surfkit.depth.prepare import WITHOUT_DEPTH, DepthPreparation, EstimatedPhoto
 from surfkit.evaluate.images.pictures import colour_depth, write_picture
-from surfkit.io.datasets.data import Reading
-from surfkit.io.datasets.depth_files import FOLDER, RECORD, DepthFile, map_path
+from surfkit.io.datasets.data import ReadSettings
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, DepthFile, map_path
 from surfkit.io.datasets.depth_prior import trust_warning
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device, torch_device
@@ -38,7 +38,7 @@ OVERVIEW_VIEWS = 4
 
 
 @dataclass(frozen=True)
-class Depth:
+class PrepareDepthCommand:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
     An interrupted command continues when it is given again. Damaged photographs are passed over. Two methods are
@@ -56,7 +56,7 @@ class Depth:
     again: bool = False
     """Also estimate depth maps again that exist already, such as with other settings."""
 
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    reading: Annotated[ReadSettings, tyro.conf.arg(name="")] = ReadSettings()
     """How the data set is read."""
 
     device: Device = "auto"
@@ -73,9 +73,9 @@ class Depth:
     @property
     def folder(self) -> Path:
         """Where the maps are written."""
-        return self.data / FOLDER
+        return self.data / DEPTH_FOLDER
 
-    def make(self, renew: bool = False) -> list[Prepared]:
+    def make(self, renew: bool = False) -> list[EstimatedPhoto]:
         """Estimate what is not there, and return what was estimated.
 
         Args:
@@ -86,7 +86,7 @@ class Depth:
             BadInput: There are maps that are not to be replaced, or nothing can be estimated.
         """
         data = self.reading.of(self.data, test_every=0)
-        preparation = Preparation(data, self.estimator, torch_device(self.device))
+        preparation = DepthPreparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
         if notice := self.estimator.notice():
             emit(Warned(notice))
@@ -104,7 +104,7 @@ class Depth:
         return done
 
 
-def with_progress(steps: Iterable[Prepared], total: int) -> list[Prepared]:
+def with_progress(steps: Iterable[EstimatedPhoto], total: int) -> list[EstimatedPhoto]:
     """The results, with bars on a terminal while they come; where there is no terminal, a line for each."""
     console, done = Console(stderr=True), []
     with bars(console):
@@ -119,7 +119,7 @@ def with_progress(steps: Iterable[Prepared], total: int) -> list[Prepared]:
     return done
 
 
-def show(done: list[Prepared]) -> None:
+def show(done: list[EstimatedPhoto]) -> None:
     """What was estimated, as a table, and by name what was not."""
     covered = [step.coverage for step in done if step.coverage is not None]
     mean = f"{sum(covered) / len(covered):.0%}" if covered else "-"
@@ -135,7 +135,7 @@ def show(done: list[Prepared]) -> None:
 def refuse_none(root: Path, views: Sequence[View], tried: int) -> None:
     """BadInput if no view has a map, though so many were tried; then nothing says that there are some."""
     if not any(map_path(root, view.name).exists() for view in views):
-        (root / FOLDER / RECORD).unlink(missing_ok=True)
+        (root / DEPTH_FOLDER / DEPTH_RECORD).unlink(missing_ok=True)
         raise BadInput(f"{root}: no depth can be estimated of any of {tried} photographs: they {WITHOUT_DEPTH}")
 
 

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from surfkit.apps.prepare_depth import OVERVIEW, Depth
+from surfkit.apps.prepare_depth import OVERVIEW, PrepareDepthCommand
 from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.prepare import PICTURE, Preparation
-from surfkit.apps.sfm.settings import REPORT, WORK, Settings
+from surfkit.apps.sfm.prepare import CAMERAS_PICTURE, SfmPreparation
+from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
 from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
@@ -22,26 +22,26 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
-from surfkit.core.stages import Stages, key_of
+from surfkit.core.stages import StageFolder, key_of
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare import Preparation as DepthMaps
-from surfkit.io.datasets.data import Data, Reading
-from surfkit.io.datasets.depth_files import FOLDER, read_record
+from surfkit.depth.prepare import DepthPreparation as DepthMaps
+from surfkit.io.datasets.data import Data, ReadSettings
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER, read_record
 from surfkit.io.datasets.depth_prior import trust_warning
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs.notes import collect_notes
 from surfkit.scene.camera import Camera
-from surfkit.scene.names import VIDEOS, is_video
+from surfkit.scene.names import VIDEO_SUFFIXES, is_video
 from surfkit.scene.scene import View
 from surfkit.train.bars import bars
 
-SHOWN = 10
+LISTED_PHOTOS = 10
 """Photographs without a camera that are listed."""
 
 
 @dataclass(frozen=True)
-class Photos:
+class PreparePhotosCommand:
     """Find the cameras of a folder of photographs, or of a video, by structure from motion, and write a data set that
     `surfkit train` reads.
 
@@ -51,7 +51,7 @@ class Photos:
     another estimator makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
-    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
+    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH_FOLDER")]
     """Folder of photographs and videos, in folders inside it or not, or one video; nothing is written there."""
 
     out: Path | None = None
@@ -92,7 +92,9 @@ class Photos:
         root, scene = self.photos, self.scene
         if not root.is_dir() and not is_video(root):
             what = "a file, and no video that is known by its ending" if root.exists() else "no such folder"
-            raise BadInput(f"{root}: {what}; name a folder of photographs, or a video ({', '.join(sorted(VIDEOS))})")
+            raise BadInput(
+                f"{root}: {what}; name a folder of photographs, or a video ({', '.join(sorted(VIDEO_SUFFIXES))})"
+            )
         refuse_overlap(root, scene)
         refuse_foreign(scene)
         if self.depth is not None:
@@ -100,28 +102,31 @@ class Photos:
             self.depth.refuse_missing()
             refuse_foreign_maps(scene)
         device = torch_device(self.device) if self.settings.in_torch else torch.device("cpu")
-        with collect_notes(), locked(scene / WORK):
+        with collect_notes(), locked(scene / WORK_FOLDER):
             before = maps_before(scene)
             with bars():
                 sweep(scene)
-                report = Preparation(root, scene, self.settings, self._refuse_unfit, device).run()
+                report = SfmPreparation(root, scene, self.settings, self._refuse_unfit, device).run()
             if self.depth is not None:
-                write_json(scene / REPORT, report | {"depth_maps": {"estimator": self.depth}})  # to go on from
+                write_json(scene / REPORT_FILE, report | {"depth_maps": {"estimator": self.depth}})  # to go on from
                 report |= self._depth_maps(self.depth)
             elif before is not None:
                 report["depth_maps"] = before
                 warn_outdated(scene, before)
-            write_json(scene / REPORT, report)
+            write_json(scene / REPORT_FILE, report)
         show(report, scene)
 
     def _refuse_unfit(self, photos: Sequence[Photo]) -> None:
         """BadInput if the estimator of depth does not fit photographs of these sizes."""
         if self.depth is not None:
-            self.depth.refuse_unfit([_view(photo, *Reading().size(*photo.size)) for photo in photos])
+            self.depth.refuse_unfit([_view(photo, *ReadSettings().size(*photo.size)) for photo in photos])
 
     def _depth_maps(self, estimator: DepthEstimator) -> dict[str, Any]:
         """Make the depth maps that are not there; what the report says of them, and the time of all stages."""
-        stages, command = Stages(self.scene / WORK), Depth(self.scene, estimator, device=self.device)
+        stages, command = (
+            StageFolder(self.scene / WORK_FOLDER),
+            PrepareDepthCommand(self.scene, estimator, device=self.device),
+        )
         done = stages.run("depth maps", key_of(estimator), lambda: command.make(renew=True))
         preparation = DepthMaps(Data(self.scene, test_every=0), estimator, torch_device(self.device))
         scene = read(preparation.data)
@@ -133,7 +138,7 @@ class Photos:
         return {"depth_maps": found, "seconds": stages.seconds()}
 
 
-def as_before(photos: Path, device: Device) -> Photos:
+def as_before(photos: Path, device: Device) -> PreparePhotosCommand:
     """The command as it was last completed for a folder of photographs; with the usual settings where it was not.
 
     Args:
@@ -143,9 +148,9 @@ def as_before(photos: Path, device: Device) -> Photos:
     Raises:
         BadInput: The report of the scene is damaged.
     """
-    usual = Photos(photos)
-    report = usual.scene / REPORT
-    if not (usual.scene / WORK).is_dir() or not report.is_file():
+    usual = PreparePhotosCommand(photos)
+    report = usual.scene / REPORT_FILE
+    if not (usual.scene / WORK_FOLDER).is_dir() or not report.is_file():
         return usual
     try:
         told = read_json(report, dict[str, Any])
@@ -167,17 +172,17 @@ def refuse_foreign(scene: Path) -> None:
     """BadInput if a folder has a model or photographs that another program made: they would be replaced."""
     if scene.exists() and not scene.is_dir():
         raise BadInput(f"--out {scene} is a file; name a folder")
-    if (scene / WORK).is_dir():
+    if (scene / WORK_FOLDER).is_dir():
         return
-    if found := next((name for name in ("sparse", "images", REPORT) if (scene / name).exists()), None):
+    if found := next((name for name in ("sparse", "images", REPORT_FILE) if (scene / name).exists()), None):
         raise BadInput(f"--out {scene} has {found} that this command did not make; name another folder")
 
 
 def refuse_foreign_maps(scene: Path) -> None:
     """BadInput if a scene has depth maps that surfkit did not make: they would be replaced."""
-    if not read_record(scene) and any((scene / FOLDER).rglob("*.npy")):
+    if not read_record(scene) and any((scene / DEPTH_FOLDER).rglob("*.npy")):
         raise BadInput(
-            f"{scene / FOLDER} holds depth maps that surfkit did not make; move it away, or make none: leave out "
+            f"{scene / DEPTH_FOLDER} holds depth maps that surfkit did not make; move it away, or make none: leave out "
             "depth:NAME"
         )
 
@@ -185,10 +190,10 @@ def refuse_foreign_maps(scene: Path) -> None:
 def maps_before(scene: Path) -> dict[str, Any] | None:
     """What the report of a scene says of the depth maps that this command made; None where there are none."""
     try:
-        maps = read_json(scene / REPORT, dict[str, Any]).get("depth_maps")
+        maps = read_json(scene / REPORT_FILE, dict[str, Any]).get("depth_maps")
     except BadInput:
         return None
-    return maps if isinstance(maps, dict) and (scene / FOLDER).is_dir() else None
+    return maps if isinstance(maps, dict) and (scene / DEPTH_FOLDER).is_dir() else None
 
 
 def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
@@ -201,7 +206,7 @@ def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
         outdated = True
     if outdated:
         what = "has depth maps of other cameras or photographs, which training would use"
-        emit(Warned(f"{scene / FOLDER} {what}; depth:NAME renews them"))
+        emit(Warned(f"{scene / DEPTH_FOLDER} {what}; depth:NAME renews them"))
 
 
 def _view(photo: Photo, width: int, height: int) -> View:
@@ -243,10 +248,10 @@ def show(report: dict[str, Any], scene: Path) -> None:
     rows.append(("seconds", ", ".join(f"{name} {value:.0f}" for name, value in report["seconds"].items())))
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
-    for name, why in list(lost.items())[:SHOWN]:
+    for name, why in list(lost.items())[:LISTED_PHOTOS]:
         tell(f"no camera for {name!r}: {why}")
-    if len(lost) > SHOWN:
-        tell(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
-    tell(f"data set in {str(scene)!r}; picture of its cameras: {str(scene / PICTURE)!r}")
+    if len(lost) > LISTED_PHOTOS:
+        tell(f"and for {len(lost) - LISTED_PHOTOS} more: see {scene / REPORT_FILE}")
+    tell(f"data set in {str(scene)!r}; picture of its cameras: {str(scene / CAMERAS_PICTURE)!r}")
     if report.get("depth_maps"):
-        tell(f"depth maps in {str(scene / FOLDER)!r}; picture of some: {str(scene / FOLDER / OVERVIEW)!r}")
+        tell(f"depth maps in {str(scene / DEPTH_FOLDER)!r}; picture of some: {str(scene / DEPTH_FOLDER / OVERVIEW)!r}")

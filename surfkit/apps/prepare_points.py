@@ -11,7 +11,7 @@ import tyro
 
 from surfkit.apps.prepare_photos import refuse_foreign
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher
-from surfkit.apps.sfm.settings import WORK, Settings
+from surfkit.apps.sfm.settings import WORK_FOLDER, Settings
 from surfkit.apps.sfm.sift import SIFT, PyCOLMAP
 from surfkit.apps.sfm.tie_points import TiePoints
 from surfkit.cli.table import print_table, tell
@@ -28,7 +28,7 @@ from surfkit.train.bars import bars
 
 
 @dataclass(frozen=True)
-class Points:
+class PreparePointsCommand:
     """Match the photographs of a data set whose cameras are known, and triangulate points, which stereo and training
     start from: for cameras of Metashape, Pix4D, RealityCapture or NeRF programs, whose files have none, and for COLMAP
     models of poses alone.
@@ -105,7 +105,7 @@ class Points:
         if scene.resolve().is_relative_to(self.data.resolve()):
             raise BadInput(f"--out {scene} lies in the data set {self.data}; name a folder outside")
         refuse_foreign(scene)
-        with collect_notes(), bars(), locked(scene / WORK):
+        with collect_notes(), bars(), locked(scene / WORK_FOLDER):
             sweep(scene)
             report = TiePoints(data, scene, settings, device).run()
         show(report, scene)

@@ -9,7 +9,7 @@ from surfkit.cli.table import print_failures, print_table
 
 
 @dataclass(frozen=True)
-class Recipes:
+class RecipesCommand:
     """List the recipes that `surfkit train recipe:NAME` accepts."""
 
     def run(self) -> None:
@@ -18,4 +18,4 @@ class Recipes:
         print_failures()
 
 
-COMMAND = Recipes
+COMMAND = RecipesCommand

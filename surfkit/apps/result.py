@@ -21,7 +21,7 @@ LPIPS = {
 }
 """Names in metrics.json, and on the screen."""
 
-UNITS = {"m": "metre", "unit": "unit"}
+LENGTH_UNITS = {"m": "metre", "unit": "unit"}
 """Of lengths of a mesh in metrics.json."""
 
 
@@ -327,7 +327,7 @@ def quality_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         size = f"in balls of {rough['radius']:.3g} {unit}"
         planes = f"{rough['on_planes']:.3g} {unit} {size}; {rough['planes']:.0%} of the area is planes"
     return [
-        ("triangles", f"{found['triangles']:,}, {found['triangles_per_area']:,.4g} per square {UNITS[unit]}"),
+        ("triangles", f"{found['triangles']:,}, {found['triangles_per_area']:,.4g} per square {LENGTH_UNITS[unit]}"),
         ("boundary edges", f"{found['boundary_share']:.2%} of {found['edges']:,}"),
         ("connected parts", f"{found['components']:,}"),
         ("non-manifold edges", f"{found['non_manifold_edges']:,}"),

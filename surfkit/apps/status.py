@@ -14,15 +14,15 @@ from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.runs.blocks.eta import seconds_elapsed, seconds_left
-from surfkit.runs.status import Block, Status, as_json, status
+from surfkit.runs.status import BlockStatus, Status, as_json, status
 
-UNFINISHED = 3
-SILENT_S = 60.0
+UNFINISHED_STATUS = 3
+MAX_SILENT_S = 60.0
 """A block that is worked on gives signs of life more often."""
 
 
 @dataclass(frozen=True)
-class StatusOf:
+class StatusCommand:
     """Show the progress of a run: step, speed, time left, memory, measurements, notes, and its processes.
 
     Exit status: 0 when the run is finished, 3 when it is not, 2 when there is no run.
@@ -43,7 +43,7 @@ class StatusOf:
             print_table(("what", "value"), rows(found))
             if found.state == "stopped":
                 tell_how_to_go_on(self.run_folder)
-        return 0 if found.state == "finished" else UNFINISHED
+        return 0 if found.state == "finished" else UNFINISHED_STATUS
 
 
 def rows(found: Status) -> list[tuple[str, str]]:
@@ -86,14 +86,14 @@ def tell_how_to_go_on(out: Path) -> None:
         tell(f"next: `{train_command(opened(out))}` goes on with the run")
 
 
-def _where(block: Block) -> str:
+def _where(block: BlockStatus) -> str:
     if not block.views:
         return "no views; stays as it is in the coarse model"
     kind = f" ({block.kind})" if block.kind else ""
     parts = [f"{block.status}{kind}{f': {block.error}' if block.error else ''}"]
     silent = time.time() - block.heard if block.status == "running" else 0.0
-    left = seconds_left(block) if silent <= SILENT_S else None
-    parts += [f"but silent for {clock(silent)}"] * (silent > SILENT_S)
+    left = seconds_left(block) if silent <= MAX_SILENT_S else None
+    parts += [f"but silent for {clock(silent)}"] * (silent > MAX_SILENT_S)
     parts.append(f"step {block.step:,} of {block.steps:,}")
     parts += [clock(seconds) for seconds in [seconds_elapsed(block)] if seconds is not None]
     parts += [f"{clock(seconds)} left" for seconds in [left] if seconds is not None]
@@ -103,4 +103,4 @@ def _where(block: Block) -> str:
     return ", ".join(parts)
 
 
-COMMAND = StatusOf
+COMMAND = StatusCommand

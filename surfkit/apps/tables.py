@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.cli.table import print_failures, print_table
-from surfkit.cli.tables import MARK, tables
+from surfkit.cli.tables import TABLE_PREFIX, tables
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.registry import unknown
@@ -18,7 +18,7 @@ from surfkit.study.ablation import Table, build, built_on
 
 
 @dataclass(frozen=True)
-class Tables:
+class TablesCommand:
     """List the ablation tables that `surfkit ablate table:NAME` accepts, or the rows of one."""
 
     table: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[table:NAME|FILE]")] = None
@@ -31,15 +31,15 @@ class Tables:
             print_table(("table", "rows", "what it shows"), [(n, str(len(t.rows)), t.about) for n, t in known.items()])
             print_failures()
             return
-        name = self.table.removeprefix(MARK)
-        known = tables([MARK + name])
+        name = self.table.removeprefix(TABLE_PREFIX)
+        known = tables([TABLE_PREFIX + name])
         if name not in known:
             raise BadInput(unknown("table", name, known) + "; or name a file, FILE.json or FILE.py")
         print(f"{known[name].about}\n")
         print_table(("", "row", "on", "what it changes"), rows_of(known[name]))
 
 
-COMMAND = Tables
+COMMAND = TablesCommand
 
 
 def rows_of(table: Table) -> list[tuple[str, str, str, str]]:

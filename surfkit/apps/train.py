@@ -21,7 +21,7 @@ from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.registry import choice
-from surfkit.io.datasets.data import Reading
+from surfkit.io.datasets.data import ReadSettings
 from surfkit.io.datasets.read import bare_photographs
 from surfkit.raster.select import Device
 from surfkit.runs.blocks.schedule import Compute
@@ -48,7 +48,7 @@ def named_recipe() -> str:
 
 
 @dataclass(frozen=True)
-class Train:
+class TrainCommand:
     """Train a model, and make its mesh, from photographs with known cameras.
 
     An interrupted run continues when the same command is given again, and a finished run when --steps is raised. Any
@@ -72,7 +72,7 @@ class Train:
     all phases. When this is raised later, the run continues with the schedules of the new length. Default: those of the
     recipe; for recipe:surface and others that begin at stereo depth, 30 for each photograph, 120 on a GPU."""
 
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    reading: Annotated[ReadSettings, tyro.conf.arg(name="")] = ReadSettings()
     """How the data set is read."""
 
     device: Device = "auto"
@@ -225,4 +225,4 @@ class Train:
         return EXAMPLE
 
 
-COMMAND = Train
+COMMAND = TrainCommand

@@ -12,7 +12,7 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.io.datasets import extract
 from surfkit.raster.select import Device
-from surfkit.runs.blocks.block import Block, plan_file, read_plan
+from surfkit.runs.blocks.block import BlockRun, plan_file, read_plan
 from surfkit.runs.blocks.worker import train_block
 from surfkit.runs.command import train_command
 from surfkit.runs.context import RunContext
@@ -26,7 +26,7 @@ from surfkit.train.faults import in_one_line
 
 
 @dataclass(frozen=True)
-class Tune:
+class TrainBlockCommand:
     """Train one block of a run to its end, from its last checkpoint.
 
     For all blocks, `surfkit train` does this. Use this command to divide the blocks between machines that share the run
@@ -79,9 +79,9 @@ class Tune:
         scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
         with scalars, collect_notes(), in_one_line(self.run_folder), bars():
             rasterizer, _ = select_rasterizer(self.device)
-            block = Block(run, plan, self.block)
+            block = BlockRun(run, plan, self.block)
             scene = extract.load(block.views_file).scene  # the data set may be much larger
             return train_block(RunContext(run, scene, rasterizer, intervals, caches), block, self.patience)
 
 
-COMMAND = Tune
+COMMAND = TrainBlockCommand

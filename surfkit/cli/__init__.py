@@ -17,7 +17,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
-from surfkit.cli.help_cache import HELP, keep, kept_help, show_kept
+from surfkit.cli.help_cache import HELP_FLAGS, keep, kept_help, show_kept
 from surfkit.cli.streams import (
     READER_LEFT,
     outlive_terminal,
@@ -185,7 +185,7 @@ def _release(error: BaseException | None) -> None:
 
 def _dispatch(words: list[str]) -> int:
     words = as_help(words)
-    if not words or words[0] in HELP:
+    if not words or words[0] in HELP_FLAGS:
         print(overview())
         return 0
     if words[0] in ("-V", "--version"):
@@ -208,7 +208,7 @@ def _dispatch(words: list[str]) -> int:
     if isinstance(command, dict):
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
-            if rest and rest[0] not in (*HELP, "help"):
+            if rest and rest[0] not in (*HELP_FLAGS, "help"):
                 raise BadInput(f"{name} has no {rest[0]!r}; {_meant(rest[0], command)}usage: {wanted}")
             first = f"`surfkit {name} {next(iter(command))} --help` tells more."
             print(f"{_given(words).summary}\n\nusage: {wanted}\n\n{first}")

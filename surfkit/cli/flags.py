@@ -14,7 +14,7 @@ from surfkit.cli.slots import join, members, slots
 from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, kebab
 
-LIKENESS = 0.75
+MIN_LIKENESS = 0.75
 """Least similarity of two flags, from 0 to 1, for one to be suggested in place of the other."""
 
 
@@ -38,9 +38,9 @@ def explain_flag(command: type, flag: str, argv: Sequence[str]) -> str | None:
     if bringing := owners(command, flag, argv):
         return f"{flag} does not apply here; it belongs to {' or '.join(bringing[:3])}, which is not chosen"
     known = {name: name.removeprefix("--").rpartition(".")[2] for name in flags(command, argv)}
-    near = difflib.get_close_matches(flag, known, n=2, cutoff=LIKENESS)
+    near = difflib.get_close_matches(flag, known, n=2, cutoff=MIN_LIKENESS)
     if not near:  # perhaps the path before its last name was left out, or is wrong
-        last = difflib.get_close_matches(flag.removeprefix("--").rpartition(".")[2], known.values(), 1, LIKENESS)
+        last = difflib.get_close_matches(flag.removeprefix("--").rpartition(".")[2], known.values(), 1, MIN_LIKENESS)
         near = [name for name, its_last in known.items() if its_last in last][:3]
     return f"no option {flag}; perhaps you meant {' or '.join(near)}" if near else None
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 
-HELP = {"-h", "--help"}
+HELP_FLAGS = {"-h", "--help"}
 MAX_TEXTS = 64
 """Texts that are kept; the oldest go first."""
 ENVIRONMENT = ("SURFKIT_PLUGINS", "TERM", "NO_COLOR", "FORCE_COLOR", "PYTHONIOENCODING", "LANG", "LC_ALL")
@@ -28,7 +28,7 @@ def kept_help(words: Sequence[str]) -> Path | None:
     Its name stands for all that the text follows from: the words, the terminal, and each file of surfkit and of the
     packages of plugins, by size and time. Words that name a file, such as a run whose recipe decides, are not kept.
     """
-    if not HELP & set(words) or any(Path(word.partition(":")[2] or word).exists() for word in words):
+    if not HELP_FLAGS & set(words) or any(Path(word.partition(":")[2] or word).exists() for word in words):
         return None
     terminal = (shutil.get_terminal_size().columns, sys.stdout.isatty(), sys.stdout.encoding)
     found = hashlib.sha256(repr((sys.version, list(words), terminal)).encode())

@@ -26,7 +26,7 @@ from surfkit.cli.streams import recorded
 
 NONE_OF_TYRO = "None"
 """The word on a command line that tyro takes for no value."""
-NONE = "none"
+NONE_WORD = "none"
 """The word that surfkit takes and shows, as in `pretrain.densify:none`."""
 
 
@@ -97,16 +97,16 @@ def is_optional(hint: Any) -> bool:
 
 def _with_lower_case(spec: PrimitiveConstructorSpec) -> PrimitiveConstructorSpec:
     """The same rule, which takes "none", also as Python writes it, and does not name it among the types."""
-    choices = spec.choices and tuple(NONE if choice == NONE_OF_TYRO else choice for choice in spec.choices)
+    choices = spec.choices and tuple(NONE_WORD if choice == NONE_OF_TYRO else choice for choice in spec.choices)
     types = spec.metavar.replace("{None}|", "").replace("{None,", "{")
     if types.startswith("{[") and types.endswith("]}"):  # of any number of values
         types = types[1:-1]
 
     def made(words: list[str]) -> Any:
-        return spec.instance_from_str([NONE_OF_TYRO if word == NONE else word for word in words])
+        return spec.instance_from_str([NONE_OF_TYRO if word == NONE_WORD else word for word in words])
 
     def written(value: Any) -> list[str]:
-        return [NONE if word == NONE_OF_TYRO else word for word in spec.str_from_instance(value)]
+        return [NONE_WORD if word == NONE_OF_TYRO else word for word in spec.str_from_instance(value)]
 
     return replace(spec, choices=choices, metavar=types, instance_from_str=made, str_from_instance=written)
 
@@ -122,7 +122,7 @@ def _shown(field: StructFieldSpec) -> StructFieldSpec:
 
 def _default(label: str) -> str:
     """What follows the text of a setting that may have no value."""
-    return "" if label in (NONE, NONE_OF_TYRO) else f"(default: {label}; none for no value)"
+    return "" if label in (NONE_WORD, NONE_OF_TYRO) else f"(default: {label}; none for no value)"
 
 
 def _joined(text: str | Callable[[], str | None]) -> str | None:

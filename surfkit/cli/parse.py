@@ -25,10 +25,18 @@ from tyro._errors import (
 )
 
 from surfkit.cli.flags import explain_flag, flags, negations_with_their_flag
-from surfkit.cli.help_cache import HELP
+from surfkit.cli.help_cache import HELP_FLAGS
 from surfkit.cli.help_text import described, rules_of_help
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import WHOLE, bare_words, choices_first, explain_bare, explain_choice, flags_as_choices, slots
+from surfkit.cli.slots import (
+    WHOLE_PREFIXES,
+    bare_words,
+    choices_first,
+    explain_bare,
+    explain_choice,
+    flags_as_choices,
+    slots,
+)
 from surfkit.cli.tables import files_as_choices
 from surfkit.core.check import BadInput
 
@@ -37,7 +45,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-USUAL = ("surface", "citygs2", "2dgs", "3dgs")
+COMMON_RECIPES = ("surface", "citygs2", "2dgs", "3dgs")
 """Recipes that an error names where there are more than so many; a command lists them all."""
 _CONFIG = (tyro.conf.CascadeSubcommandArgs,)
 _NO_TYPE = re.compile(r"no type matching (.*) could be instantiated from \[(.*?)\]\. Got errors:.*")
@@ -115,9 +123,9 @@ def _refuse_nan(settings: T, at: str = "") -> T:
 def _default(command: type, argv: Sequence[str]) -> list[str]:
     """The word for the recipe or the table that a command takes when none is named, if it has one in `default_recipe`
     or in `default_table`."""
-    for whole in WHOLE:
+    for whole in WHOLE_PREFIXES:
         name = getattr(command, f"default_{whole.rstrip(':')}", None)
-        if name is not None and not any(word.startswith(whole) for word in argv) and not HELP & set(argv):
+        if name is not None and not any(word.startswith(whole) for word in argv) and not HELP_FLAGS & set(argv):
             return [f"{whole}{name}"]
     return []
 
@@ -125,7 +133,7 @@ def _default(command: type, argv: Sequence[str]) -> list[str]:
 def _explained(event: ParseErrorEvent, command: type, argv: Sequence[str], prog: str) -> str | None:
     """One line for what tyro found wrong; None for a kind of error that this does not know."""
     known = slots(command, argv)
-    for whole in WHOLE:
+    for whole in WHOLE_PREFIXES:
         slot = whole.rstrip(":")
         if slot in known and not any(word.startswith(whole) for word in argv):
             return _nothing_chosen(slot, known[slot], command, argv)
@@ -155,7 +163,11 @@ def _nothing_chosen(slot: str, names: Sequence[str], command: type, argv: Sequen
     meant = next(filter(None, (explain_bare(command, word, argv) for word in bare_words(command, argv))), None)
     if meant is not None and f"{slot}:" in meant:
         return f"no {slot} chosen: {meant}"
-    shown = names if len(names) <= len(USUAL) else [name for name in USUAL if name in names] or names[: len(USUAL)]
+    shown = (
+        names
+        if len(names) <= len(COMMON_RECIPES)
+        else [name for name in COMMON_RECIPES if name in names] or names[: len(COMMON_RECIPES)]
+    )
     listed = f"; `surfkit {slot}s` lists all {len(names)}" if len(shown) < len(names) else ""
     chosen = f"no {slot} chosen: add one of {', '.join(f'{slot}:{name}' for name in shown)}{listed}"
     return f"{meant} And {chosen}" if meant is not None else chosen

@@ -16,7 +16,7 @@ from surfkit.core.tree import evolve
 
 
 @dataclass(frozen=True)
-class Place:
+class SlotPath:
     """A tuple or dict of components inside a recipe, and one position or key there.
 
     Attributes:
@@ -69,7 +69,7 @@ def open_places(recipe: Any, argv: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {slot: place.names for slot in named if (place := _place(recipe, slot))}
 
 
-def _place(recipe: Any, slot: str) -> Place | None:
+def _place(recipe: Any, slot: str) -> SlotPath | None:
     """Where the last step of a slot's path lies, if in a tuple or dict of components and not beyond its end."""
     *path, last = slot.split(".")
     node, hint, taken = recipe, Any, []
@@ -87,9 +87,9 @@ def _place(recipe: Any, slot: str) -> Place | None:
     if base is None:
         return None
     if isinstance(node, dict):
-        return Place(".".join(taken), node, last, base)
+        return SlotPath(".".join(taken), node, last, base)
     if isinstance(node, tuple) and last.isdecimal() and int(last) <= len(node):
-        return Place(".".join(taken), node, int(last), base)
+        return SlotPath(".".join(taken), node, int(last), base)
     return None
 
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from surfkit.cli.help_cache import HELP
+from surfkit.cli.help_cache import HELP_FLAGS
 from surfkit.cli.parts import with_parts
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -61,7 +61,7 @@ def recipe_choice(argv: Sequence[str] = ()) -> Any:
     known = recipes(argv)
     if not known:
         raise BadInput("no plugin in use offers a recipe; name a file instead: recipe:FILE.json")
-    if argv and not HELP & set(argv):
+    if argv and not HELP_FLAGS & set(argv):
         known = dict(sorted(known.items(), key=lambda item: item[0] != chosen_name(argv))[:2])
     members = tuple(_subcommand(name, recipe) for name, recipe in known.items())
     return Union[members]  # noqa: UP007 (made at run time)

@@ -17,7 +17,7 @@ from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, kebab, unknown
 
 Slots = dict[str, tuple[str, ...]]
-WHOLE = ("recipe:", "table:")
+WHOLE_PREFIXES = ("recipe:", "table:")
 """What a command is about as a whole, chosen before any part."""
 
 
@@ -63,7 +63,7 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
     names = {word: known.get(word.partition(":")[0], ()) for word in argv}
     choices = [word for word in argv if word.partition(":")[2] in names[word]]
     others = [word for word in argv if word.partition(":")[2] not in names[word]]
-    choices.sort(key=lambda word: (not word.startswith(WHOLE), word.partition(":")[0].count(".")))
+    choices.sort(key=lambda word: (not word.startswith(WHOLE_PREFIXES), word.partition(":")[0].count(".")))
     done = handled(argv) if "recipe" in known else set()
     return [word for word in choices if len(names[word]) > 1 and word not in done] + [
         w for w in others if w not in done
@@ -119,7 +119,7 @@ def bare_words(command: type, argv: Sequence[str]) -> list[str]:
 
 
 def _whole(known: Slots) -> list[str]:
-    return [mark.rstrip(":") for mark in WHOLE if mark.rstrip(":") in known]
+    return [mark.rstrip(":") for mark in WHOLE_PREFIXES if mark.rstrip(":") in known]
 
 
 def _below(hint: Any, value: Any, path: str) -> Slots:

@@ -16,7 +16,7 @@ READER_LEFT = 141
 STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
 
 
-class Record(io.StringIO):
+class ScreenRecord(io.StringIO):
     """What was printed, in the colours and the letters of a screen."""
 
     def __init__(self, screen: TextIO) -> None:
@@ -34,10 +34,10 @@ class Record(io.StringIO):
 
 
 @contextmanager
-def recorded() -> Iterator[Record]:
+def recorded() -> Iterator[ScreenRecord]:
     """Within, what would go to stdout is recorded, and does not appear."""
     screen = sys.stdout
-    sys.stdout = record = Record(screen)
+    sys.stdout = record = ScreenRecord(screen)
     try:
         yield record
     finally:

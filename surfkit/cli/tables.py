@@ -12,12 +12,12 @@ from surfkit.core.check import BadInput
 from surfkit.study.ablation import Table, offered_tables
 from surfkit.study.table_file import is_table_file, read_table
 
-MARK = "table:"
+TABLE_PREFIX = "table:"
 
 
 def tables(argv: Sequence[str] = ()) -> dict[str, Table]:
     """Offered tables by name, and the table of every file that `argv` names as table:FILE."""
-    named = [word.removeprefix(MARK) for word in argv if word.startswith(MARK)]
+    named = [word.removeprefix(TABLE_PREFIX) for word in argv if word.startswith(TABLE_PREFIX)]
     return offered_tables() | {name: read_table(name) for name in named if is_table_file(name)}
 
 
@@ -25,7 +25,9 @@ def files_as_choices(argv: Sequence[str]) -> list[str]:
     """The same words, with FILE.json, FILE.py and FILE.py:NAME rewritten to table:FILE, where they are no value."""
     before = ["", *argv]
     return [
-        MARK + word if is_table_file(word) and not word.startswith(("-", MARK)) and not last.startswith("--") else word
+        TABLE_PREFIX + word
+        if is_table_file(word) and not word.startswith(("-", TABLE_PREFIX)) and not last.startswith("--")
+        else word
         for last, word in zip(before, argv, strict=False)
     ]
 

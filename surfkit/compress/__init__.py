@@ -10,11 +10,11 @@ def surfkit_components():
     from surfkit.compress.format import SurfkitFile
     from surfkit.compress.packed import Packed
     from surfkit.compress.plain import Float16, Lossless
-    from surfkit.compress.scalars import Cells, Floats, Levels, LogSteps, SmallestThree
+    from surfkit.compress.scalars import Floats, LogSteps, MortonPositions, SmallestThree, UniformLevels
     from surfkit.compress.vectree import Vectree
 
     encodings = {
-        "cells": Cells, "codes": Codes, "floats": Floats, "levels": Levels, "log-steps": LogSteps,
+        "cells": MortonPositions, "codes": Codes, "floats": Floats, "levels": UniformLevels, "log-steps": LogSteps,
         "principal-components": PrincipalComponents, "smallest-three": SmallestThree,
     }  # fmt: skip
     compressors = {"float16": Float16, "lossless": Lossless, "packed": Packed, "vectree": Vectree}

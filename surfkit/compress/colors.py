@@ -16,28 +16,28 @@ from surfkit.compress.streams import Streams
 from surfkit.core.check import BadInput
 from surfkit.primitives.points import Columns
 
-COLUMNS = ("sh0", "sh_rest")
-CHOSEN = "sh.chosen"
+SH_COLUMNS = ("sh0", "sh_rest")
+CHOSEN_MARK = "sh.chosen"
 """The mark of points whose harmonics become codes."""
 
 
 def vectors(values: Columns) -> np.ndarray:
     """(n, 3 K) coefficients of n points, the three colours of each in turn."""
-    return np.concatenate([flat(values, name) for name in COLUMNS], axis=1)
+    return np.concatenate([flat(values, name) for name in SH_COLUMNS], axis=1)
 
 
 def colors(numbers: np.ndarray, kinds: Mapping[str, ColumnType]) -> Columns:
     """The columns of (n, 3 K) coefficients."""
-    split = kinds[COLUMNS[0]].width
+    split = kinds[SH_COLUMNS[0]].width
     return {
-        COLUMNS[0]: kinds[COLUMNS[0]].rows(numbers[:, :split]),
-        COLUMNS[1]: kinds[COLUMNS[1]].rows(numbers[:, split:]),
+        SH_COLUMNS[0]: kinds[SH_COLUMNS[0]].rows(numbers[:, :split]),
+        SH_COLUMNS[1]: kinds[SH_COLUMNS[1]].rows(numbers[:, split:]),
     }
 
 
 def width(kinds: Mapping[str, ColumnType]) -> int:
     """Coefficients of a point."""
-    return sum(kinds[name].width for name in COLUMNS)
+    return sum(kinds[name].width for name in SH_COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PrincipalComponents(Encoding):
     @property
     def columns(self) -> tuple[str, ...]:
         """See `Encoding.columns`."""
-        return COLUMNS
+        return SH_COLUMNS
 
     def encode(self, values: Columns, kinds: Mapping[str, ColumnType], leaf: Leaf, tables: Tables) -> Streams:
         """See `Encoding.encode`."""
@@ -112,14 +112,14 @@ class Codes(Encoding):
     @property
     def columns(self) -> tuple[str, ...]:
         """See `Encoding.columns`."""
-        return COLUMNS
+        return SH_COLUMNS
 
     def encode(self, values: Columns, kinds: Mapping[str, ColumnType], leaf: Leaf, tables: Tables) -> Streams:
         """See `Encoding.encode`."""
         from surfkit.compress.kmeans import nearest
 
-        numbers, chosen = vectors(values), values[CHOSEN].numpy()
-        found = {CHOSEN: np.packbits(chosen)[:, None], "sh": float_bits(numbers[~chosen], "float16", "sh")}
+        numbers, chosen = vectors(values), values[CHOSEN_MARK].numpy()
+        found = {CHOSEN_MARK: np.packbits(chosen)[:, None], "sh": float_bits(numbers[~chosen], "float16", "sh")}
         for at, (part, book) in enumerate(zip(self._parts(), self._books(kinds, tables), strict=True)):
             name = f"sh.code.{at}"
             if name in values:
@@ -134,7 +134,7 @@ class Codes(Encoding):
         self, streams: Streams, kinds: Mapping[str, ColumnType], leaf: Leaf, count: int, tables: Tables
     ) -> Columns:
         """See `Encoding.decode`."""
-        bits = stream(streams, CHOSEN, -(-count // 8), 1)[:, 0]
+        bits = stream(streams, CHOSEN_MARK, -(-count // 8), 1)[:, 0]
         chosen = np.unpackbits(bits.astype(np.uint8), count=count).astype(bool)
         numbers, codes = np.empty((count, width(kinds)), np.float32), int(chosen.sum())
         numbers[~chosen] = bits_float(stream(streams, "sh", count - codes, width(kinds)), "float16")
@@ -143,7 +143,7 @@ class Codes(Encoding):
             if codes and code.max() >= len(book):
                 raise BadInput(f"stream sh.code.{at} names code {code.max()} of {len(book)}")
             numbers[np.nonzero(chosen)[0][:, None], np.arange(part.start, part.stop)] = book[code]
-        return colors(numbers, kinds) | {CHOSEN: torch.from_numpy(chosen)}
+        return colors(numbers, kinds) | {CHOSEN_MARK: torch.from_numpy(chosen)}
 
     def _parts(self) -> list[slice]:
         ends = np.cumsum([0, *self.parts]).tolist()

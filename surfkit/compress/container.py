@@ -18,9 +18,9 @@ import torch
 from surfkit.compress.base import Compressor, Plan, kinds_of
 from surfkit.compress.encoding import ColumnType, stream
 from surfkit.compress.index import (
-    HEAD,
+    HEADER_STRUCT,
     TABLE_TYPES,
-    Block,
+    ChecksummedBlock,
     ColumnEntry,
     Index,
     LeafEntry,
@@ -32,7 +32,7 @@ from surfkit.compress.index import (
     refuse_unencoded,
     table_shape,
 )
-from surfkit.compress.octree import MOST, Leaf, leaves
+from surfkit.compress.octree import MAX_LEAF_POINTS, Leaf, leaves
 from surfkit.compress.streams import packed, unpacked
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
@@ -52,7 +52,7 @@ def write_model(
     compressor: Compressor,
     frame: Frame | None = None,
     progress: Callable[[int, int], None] | None = None,
-    most: int = MOST,
+    most: int = MAX_LEAF_POINTS,
 ) -> int:
     """Write a model as its plan says; the bytes of the file, which appears only when it is complete.
 
@@ -75,7 +75,7 @@ def write_model(
     shared = {f"shared.{name}": model.params[name].detach().numpy() for name in sorted(model.primitive.shared())}
     refuse_not_finite({name: torch.from_numpy(value) for name, value in shared.items()})
     with replacing(path) as file:
-        file.write(b"\0" * HEAD.size)
+        file.write(b"\0" * HEADER_STRUCT.size)
         tables = {
             name: TableEntry(str(value.dtype), value.shape, _append(file, _table_bytes(name, value)))
             for name, value in (dict(plan.tables) | shared).items()
@@ -217,7 +217,7 @@ class ModelFile:
             return None
         return Frame(np.array(place.origin), place.scale, place.metres, place.crs, place.shift)
 
-    def _block(self, block: Block) -> memoryview:
+    def _block(self, block: ChecksummedBlock) -> memoryview:
         data = self.data[block.offset : block.offset + block.length]
         if zlib.crc32(data) != block.crc:
             raise BadInput("damaged (checksum)")
@@ -260,10 +260,10 @@ def refuse_not_finite(values: Columns) -> None:
             raise BadInput(f"{name}: NaN or Inf in {int((~value.isfinite()).sum())} places; such a model is of no use")
 
 
-def _append(file: BinaryIO, data: bytes) -> Block:
+def _append(file: BinaryIO, data: bytes) -> ChecksummedBlock:
     offset = file.tell()
     file.write(data)
-    return Block(offset, len(data), zlib.crc32(data))
+    return ChecksummedBlock(offset, len(data), zlib.crc32(data))
 
 
 def _table_bytes(name: str, value: np.ndarray) -> bytes:

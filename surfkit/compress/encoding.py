@@ -20,7 +20,7 @@ from surfkit.primitives.points import Columns
 
 Tables = Mapping[str, np.ndarray]
 """Arrays that all leaves share, such as codebooks."""
-MOST_STEPS = 1 << 22
+MAX_QUANTIZED = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def from_whole(name: str, numbers: np.ndarray) -> Streams:
     Raises:
         BadInput: Numbers of 2^22 or more, whose multiples of a step float32 does not tell apart.
     """
-    if numbers.size and not np.abs(numbers).max() < MOST_STEPS:
+    if numbers.size and not np.abs(numbers).max() < MAX_QUANTIZED:
         raise BadInput(f"{name}: values of more than 2^22 steps; take longer steps, or compress:float16")
     middle = np.median(numbers, 0, keepdims=True).round() if numbers.size else np.zeros((1, numbers.shape[1]))
     return {f"{name}.middle": _smallest(_zigzag(middle)), name: _smallest(_zigzag(numbers - middle))}

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from surfkit.compress.container import ModelFile, write_model
-from surfkit.compress.index import MAGIC
+from surfkit.compress.index import CONTAINER_MAGIC
 from surfkit.compress.packed import Packed
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.base import Format
@@ -41,7 +41,7 @@ class SurfkitFile(Format):
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""
-        return head.startswith(MAGIC)
+        return head.startswith(CONTAINER_MAGIC)
 
 
 def model_of(table: SplatTable) -> SplatModel:

@@ -23,31 +23,31 @@ from dataclasses import dataclass
 from typing import Any
 
 from surfkit.compress.encoding import ColumnType, Encoding
-from surfkit.compress.octree import MOST
-from surfkit.compress.streams import MOST_COMPONENTS
+from surfkit.compress.octree import MAX_LEAF_POINTS
+from surfkit.compress.streams import MAX_COMPONENTS
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, from_json, load
 from surfkit.primitives.base import Primitive
 from surfkit.scene.scene import Frame
 
-MAGIC = b"\x89SRFK\r\n\x1a"
-VERSION = 1
-HEAD = struct.Struct("<8sIIQQQII")
-MOST_INDEX = 1 << 28
+CONTAINER_MAGIC = b"\x89SRFK\r\n\x1a"
+CONTAINER_VERSION = 1
+HEADER_STRUCT = struct.Struct("<8sIIQQQII")
+MAX_INDEX_BYTES = 1 << 28
 """Bytes of an index that is read."""
-MOST_INDEX_A_BYTE, LEAST_INDEX = 64, 1 << 16
+MAX_INDEX_EXPANSION, MIN_INDEX_BYTES = 64, 1 << 16
 """Bytes of JSON for each stored byte of an index, and what is allowed in any case: real ones have 10 or fewer."""
-MOST_POINTS_A_BYTE = 1 << 12
+MAX_POINTS_PER_BYTE = 1 << 12
 """Of a leaf: one that claims more is damaged, as even points that are all alike take more room."""
-MOST_NUMBERS_A_BYTE = 1 << 17
+MAX_NUMBERS_PER_BYTE = 1 << 17
 """Of a table, likewise."""
-MOST_AXES = 8
+MAX_TABLE_AXES = 8
 """Of a table."""
 TABLE_TYPES = {"float16": "u2", "float32": "u4", "float64": "u8", "uint8": "u1", "uint16": "u2"}
 
 
 @dataclass(frozen=True)
-class Block:
+class ChecksummedBlock:
     """A part of the file with a checksum of its own.
 
     Attributes:
@@ -66,7 +66,7 @@ class TableEntry:
 
     dtype: str
     shape: tuple[int, ...]
-    block: Block
+    block: ChecksummedBlock
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class LeafEntry:
     exponent: int
     corner: tuple[int, int, int]
     finest: int
-    block: Block
+    block: ChecksummedBlock
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class ColumnEntry:
 
 
 @dataclass(frozen=True)
-class Place:
+class FrameEntry:
     """Where the local frame of the model lies: see `scene.Frame`."""
 
     origin: tuple[float, float, float]
@@ -125,7 +125,7 @@ class Index:
     primitive: Primitive
     sh_degree: int
     near: float
-    frame: Place | None
+    frame: FrameEntry | None
     compressor: dict[str, Any]
     columns: dict[str, ColumnEntry]
     encodings: tuple[Encoding, ...]
@@ -151,17 +151,17 @@ class Index:
         if lacking:
             raise BadInput(f"table {min(lacking)} is missing")
         for name, table in self.tables.items():
-            fits = all(axis >= 0 for axis in table.shape) and len(table.shape) <= MOST_AXES
-            if not fits or math.prod(table.shape) > MOST_NUMBERS_A_BYTE * table.block.length:
+            fits = all(axis >= 0 for axis in table.shape) and len(table.shape) <= MAX_TABLE_AXES
+            if not fits or math.prod(table.shape) > MAX_NUMBERS_PER_BYTE * table.block.length:
                 raise BadInput(f"table {name}: a shape of {table.shape} in {table.block.length} bytes")
             if table.dtype not in TABLE_TYPES:
                 raise BadInput(f"table {name}: numbers of {table.dtype}; types are {', '.join(TABLE_TYPES)}")
         for at, leaf in enumerate(self.leaves):
-            fits = 0 < leaf.points <= min(MOST, MOST_POINTS_A_BYTE * leaf.block.length)
+            fits = 0 < leaf.points <= min(MAX_LEAF_POINTS, MAX_POINTS_PER_BYTE * leaf.block.length)
             fits &= abs(leaf.exponent) < 1000 and leaf.finest <= leaf.exponent
             if not fits or any(abs(corner) > 1 << 54 for corner in leaf.corner):
                 raise BadInput(f"leaf {at}: {leaf.points} points in a cube of side 2^{leaf.exponent} at {leaf.corner}")
-        end = HEAD.size
+        end = HEADER_STRUCT.size
         for block in [*(table.block for table in self.tables.values()), *(leaf.block for leaf in self.leaves)]:
             if block.offset != end or block.length < 0:
                 raise BadInput(f"a block of {block.length} bytes begins at {block.offset}, not at {end}")
@@ -170,12 +170,12 @@ class Index:
             raise BadInput(f"its blocks end at {end}, not at {start} where the index begins")
 
 
-def place_of(frame: Frame | None) -> Place | None:
+def place_of(frame: Frame | None) -> FrameEntry | None:
     """A frame as the index has it."""
     if frame is None:
         return None
     origin = tuple(float(value) for value in frame.origin)
-    return Place(origin, frame.scale, frame.metres, frame.crs, tuple(float(value) for value in frame.shift))
+    return FrameEntry(origin, frame.scale, frame.metres, frame.crs, tuple(float(value) for value in frame.shift))
 
 
 def refuse_unencoded(encodings: tuple[Encoding, ...], columns: Mapping[str, ColumnType | ColumnEntry]) -> None:
@@ -188,7 +188,7 @@ def refuse_unencoded(encodings: tuple[Encoding, ...], columns: Mapping[str, Colu
 
 def table_shape(shape: tuple[int, ...]) -> tuple[int, int]:
     """Rows and components of the stream of a table: its last axis gives the components, if it has 4096 or fewer."""
-    components = shape[-1] if shape and 0 < shape[-1] <= MOST_COMPONENTS else 1
+    components = shape[-1] if shape and 0 < shape[-1] <= MAX_COMPONENTS else 1
     return math.prod(shape) // components, components
 
 
@@ -203,7 +203,9 @@ def index_bytes(index: Index) -> bytes:
 def head_bytes(start: int, index: bytes) -> bytes:
     """What a file begins with, whose index begins at `start`."""
     numbers = struct.pack("<QQQI", start, len(index), start + len(index), zlib.crc32(index))
-    return HEAD.pack(MAGIC, VERSION, zlib.crc32(numbers), *struct.unpack("<QQQI", numbers), 0)
+    return HEADER_STRUCT.pack(
+        CONTAINER_MAGIC, CONTAINER_VERSION, zlib.crc32(numbers), *struct.unpack("<QQQI", numbers), 0
+    )
 
 
 def read_index(data: memoryview) -> Index:
@@ -214,23 +216,25 @@ def read_index(data: memoryview) -> Index:
     """
     import zstandard
 
-    if bytes(data[: len(MAGIC)]) != MAGIC:
+    if bytes(data[: len(CONTAINER_MAGIC)]) != CONTAINER_MAGIC:
         raise BadInput("no .surfkit file: it does not begin as one")
-    if len(data) < HEAD.size:
+    if len(data) < HEADER_STRUCT.size:
         raise BadInput("cut off within its head")
-    _, version, head_crc, start, length, size, crc, _ = HEAD.unpack(data[: HEAD.size])
-    if version != VERSION:
-        raise BadInput(f"version {version} of the format; this surfkit reads version {VERSION}; install a newer one")
-    if zlib.crc32(data[16 : HEAD.size - 4]) != head_crc:
+    _, version, head_crc, start, length, size, crc, _ = HEADER_STRUCT.unpack(data[: HEADER_STRUCT.size])
+    if version != CONTAINER_VERSION:
+        raise BadInput(
+            f"version {version} of the format; this surfkit reads version {CONTAINER_VERSION}; install a newer one"
+        )
+    if zlib.crc32(data[16 : HEADER_STRUCT.size - 4]) != head_crc:
         raise BadInput("its head is damaged (checksum)")
     if size != len(data):
         raise BadInput(f"has {len(data)} bytes, not {size}: cut off, or not copied whole")
-    if start < HEAD.size or start + length != size or zlib.crc32(data[start : start + length]) != crc:
+    if start < HEADER_STRUCT.size or start + length != size or zlib.crc32(data[start : start + length]) != crc:
         raise BadInput("its index is damaged (checksum)")
     part = data[start : start + length]
     try:
         unpacked = zstandard.frame_content_size(part)
-        if unpacked > min(MOST_INDEX, LEAST_INDEX + MOST_INDEX_A_BYTE * length):
+        if unpacked > min(MAX_INDEX_BYTES, MIN_INDEX_BYTES + MAX_INDEX_EXPANSION * length):
             raise BadInput(f"{unpacked} bytes of JSON in {length} bytes")
         text = zstandard.ZstdDecompressor().decompress(part, allow_extra_data=False)
         index = load(Index, from_json(text.decode()))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.cuda import codes as gpu
-from surfkit.compress.nearest import CPU, Features, Search, checked, itself, nearest, searching
+from surfkit.compress.nearest import CPU, DistanceBounds, Search, checked, itself, nearest, searching
 from surfkit.core.check import BadInput, expect
 from surfkit.raster.native import module
 
@@ -25,11 +25,11 @@ __all__ = ["kmeans", "nearest"]
 
 HALVINGS = 2
 """Times that the vectors of a code are halved, each in a better direction."""
-EACH = 64
+VECTORS_PER_CODE = 64
 """Vectors for each code that the iterations look at, unless told otherwise."""
-FEWEST = 1 << 18
+MIN_SAMPLED_VECTORS = 1 << 18
 """Vectors that the iterations look at in any case, unless told otherwise."""
-SURVEYED = 1 << 16
+DIRECTION_VECTORS = 1 << 16
 """Vectors of which the principal directions are taken."""
 
 Progress = Callable[[int, int], None]
@@ -76,7 +76,7 @@ def kmeans(
         return exact
     generator = np.random.default_rng(seed)
     rows = np.flatnonzero(weight)
-    rows = generator.permutation(rows)[: sample or max(EACH * codes, FEWEST)]
+    rows = generator.permutation(rows)[: sample or max(VECTORS_PER_CODE * codes, MIN_SAMPLED_VECTORS)]
     return Lloyd(vectors[torch.from_numpy(rows)], weight[rows], codes, generator, iterations, progress, device).run()
 
 
@@ -140,7 +140,7 @@ class Lloyd:
         if self.device.type == "cuda":
             self.features, self.of_vectors = itself, self.there
         else:
-            some = Features.of(self.vectors[:SURVEYED]).fitted(self.vectors, self.vectors[: self.codes])
+            some = DistanceBounds.of(self.vectors[:DIRECTION_VECTORS]).fitted(self.vectors, self.vectors[: self.codes])
             self.features, self.of_vectors = some, some(self.vectors)
         self.done, self.all = 0, len(self.vectors) * self.iterations
 

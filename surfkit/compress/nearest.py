@@ -20,17 +20,17 @@ from surfkit.core.check import BadInput, expect
 from surfkit.raster.native import module
 
 CPU = torch.device("cpu")
-MOST = 1e15
+MAX_VECTOR_VALUE = 1e15
 """Greatest absolute value in a vector: its square must be far from the end of float32."""
-WORK = 1 << 31
+MULTIPLICATIONS_PER_CALL = 1 << 31
 """Multiplications in one call of the compiled search, for each thread: well below a second, so that Ctrl-C works."""
-ROWS = 1 << 15
+VECTORS_PER_CALL = 1 << 15
 """Vectors in one call of the compiled search, at most."""
-ENTRIES = 1 << 21
+MAX_TORCH_DISTANCES = 1 << 21
 """Distances that the search in torch holds at once."""
-BLOCK = 16
+CODES_PER_BLOCK = 16
 """Codes that the compiled search rules out together: kBlock of cpu/nearest.h."""
-PROBES = 128
+PROBE_VECTORS = 128
 """Vectors on which the number of features is chosen."""
 FEATURES = (4, 6, 8, 10, 12, 16, 24, 32)
 """Numbers of principal components among which it is chosen, besides all of them."""
@@ -57,7 +57,7 @@ def nearest(vectors: Tensor, codebook: Tensor, device: torch.device = CPU) -> tu
         raise BadInput(f"codebook: it has no codes, and there are {len(vectors)} vectors; give at least one code")
     index, distance = torch.zeros(len(vectors), dtype=torch.int32), torch.zeros(len(vectors))
     if len(vectors):
-        features = itself if device.type == "cuda" else Features.of(codebook).fitted(vectors, codebook)
+        features = itself if device.type == "cuda" else DistanceBounds.of(codebook).fitted(vectors, codebook)
         search = searching(codebook, features, device)
         for rows in search.parts(len(vectors)):
             some = vectors[rows].to(device)
@@ -77,15 +77,19 @@ def checked(name: str, vectors: Tensor) -> Tensor:
     if vectors.shape[1] == 0:
         raise BadInput(f"{name}: expected at least one column, got {tuple(vectors.shape)}")
     vectors = vectors.detach().cpu().contiguous()
-    if len(vectors) and not max(-float(vectors.min()), float(vectors.max())) <= MOST:  # not so for NaN either
-        row = int((~(vectors.abs() <= MOST)).any(1).nonzero()[0])
-        value = next(value for value in vectors[row].tolist() if not abs(value) <= MOST)
-        raise BadInput(f"{name}: row {row} has the value {value:g}; values must be finite and at most {MOST:g}")
+    if (
+        len(vectors) and not max(-float(vectors.min()), float(vectors.max())) <= MAX_VECTOR_VALUE
+    ):  # not so for NaN either
+        row = int((~(vectors.abs() <= MAX_VECTOR_VALUE)).any(1).nonzero()[0])
+        value = next(value for value in vectors[row].tolist() if not abs(value) <= MAX_VECTOR_VALUE)
+        raise BadInput(
+            f"{name}: row {row} has the value {value:g}; values must be finite and at most {MAX_VECTOR_VALUE:g}"
+        )
     return vectors
 
 
 @dataclass(frozen=True)
-class Features:
+class DistanceBounds:
     """Fewer numbers than dimensions, whose distance is at most that of the vectors: they rule codes out.
 
     Attributes:
@@ -99,7 +103,7 @@ class Features:
     used: int
 
     @classmethod
-    def of(cls, vectors: Tensor) -> Features:
+    def of(cls, vectors: Tensor) -> DistanceBounds:
         """All principal components of (N, D) vectors."""
         mean = vectors.double().mean(0).float().double()
         centred = vectors.double() - mean
@@ -107,7 +111,7 @@ class Features:
 
     def __call__(self, vectors: Tensor) -> Tensor:
         """(N, F) float32 features of (N, D) vectors."""
-        return torch.cat([self._reduced(self._turned(part)).float() for part in vectors.split(ROWS)])
+        return torch.cat([self._reduced(self._turned(part)).float() for part in vectors.split(VECTORS_PER_CALL)])
 
     def _turned(self, vectors: Tensor) -> Tensor:
         return (vectors.double() - self.mean) @ self.axes
@@ -117,18 +121,20 @@ class Features:
             return turned
         return torch.cat([turned[:, : self.used], turned[:, self.used :].norm(dim=1, keepdim=True)], 1)
 
-    def fitted(self, vectors: Tensor, codebook: Tensor) -> Features:
+    def fitted(self, vectors: Tensor, codebook: Tensor) -> DistanceBounds:
         """With as many components as make the search fastest: with few, distances to many codes must be computed."""
-        dimensions, blocks = codebook.shape[1], len(codebook) // BLOCK
-        some = vectors[:: max(1, len(vectors) // min(PROBES, max(8, ENTRIES // len(codebook))))]
-        here, there = self._turned(some), self._turned(codebook[self.order(codebook)[: blocks * BLOCK]])
+        dimensions, blocks = codebook.shape[1], len(codebook) // CODES_PER_BLOCK
+        some = vectors[:: max(1, len(vectors) // min(PROBE_VECTORS, max(8, MAX_TORCH_DISTANCES // len(codebook))))]
+        here, there = self._turned(some), self._turned(codebook[self.order(codebook)[: blocks * CODES_PER_BLOCK]])
         fastest, least = dimensions, blocks * (dimensions + 3.0)
         nearest = torch.cdist(here, there).amin(1, keepdim=True) * (1 + 1e-6) if blocks else None
         for used in FEATURES:
             if used >= dimensions - 2 or nearest is None:
                 break
             few = replace(self, used=used)
-            bound = torch.cdist(few._reduced(here), few._reduced(there)).view(len(some), blocks, BLOCK).amin(2)
+            bound = (
+                torch.cdist(few._reduced(here), few._reduced(there)).view(len(some), blocks, CODES_PER_BLOCK).amin(2)
+            )
             hits = float((bound <= nearest).sum() / len(some))
             cost = blocks * (used + 4) + hits * (2.5 * dimensions + 40)  # in vector instructions, about
             if cost < least:
@@ -139,7 +145,7 @@ class Features:
         """(K,) int64: codes such that alike ones follow one another: in slices along three axes."""
         turned = ((codebook.double() - self.mean) @ self.axes[:, :3]).numpy()
         order = np.argsort(turned[:, 0], kind="stable")
-        slices = max(1, round((len(order) / BLOCK) ** (1 / 3)))
+        slices = max(1, round((len(order) / CODES_PER_BLOCK) ** (1 / 3)))
         for axis in range(1, turned.shape[1]):
             cell = np.arange(len(order)) // -(-len(order) // slices**axis)
             order = order[np.lexsort((turned[order, axis], cell))]
@@ -167,14 +173,14 @@ class Search(Protocol):
 class NativeSearch(Search):
     """Compiled; runs on `torch.get_num_threads()` threads."""
 
-    def __init__(self, codebook: Tensor, features: Features) -> None:
+    def __init__(self, codebook: Tensor, features: DistanceBounds) -> None:
         self.work = len(codebook) * (features.used + 4)
         arrays = codebook, features(codebook), features.order(codebook)
         self.codes = module().Codebook(*(array.numpy() for array in arrays))
 
     def parts(self, rows: int) -> Iterator[slice]:
         threads = torch.get_num_threads()
-        size = min(ROWS, max(256 * threads, WORK * threads // self.work))
+        size = min(VECTORS_PER_CALL, max(256 * threads, MULTIPLICATIONS_PER_CALL * threads // self.work))
         return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
 
     def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -196,7 +202,7 @@ class TorchSearch(Search):
         self.reach = float(self.half.max().mul(2).sqrt())
 
     def parts(self, rows: int) -> Iterator[slice]:
-        size = max(1, ENTRIES // len(self.codebook))
+        size = max(1, MAX_TORCH_DISTANCES // len(self.codebook))
         return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
 
     def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -14,15 +14,15 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 
-MOST = 1 << 17
+MAX_LEAF_POINTS = 1 << 17
 """Points of a leaf."""
-BITS = 16
+LEAF_POSITION_BITS = 16
 """Of a position in its leaf, on each axis."""
-LEVELS = 21
+MAX_TREE_LEVELS = 21
 """Of the tree at most: 3 x 21 bits number its smallest cells."""
 DIGITS = {4: 22, 8: 51}
 """Cells are at least 2^-22 of the largest coordinate in float32, 2^-51 in float64: their centres can be told apart."""
-LARGEST = 2.0**200
+MAX_COORDINATE = 2.0**200
 """Coordinates below it are taken: more than all of float32."""
 
 
@@ -58,7 +58,7 @@ class Leaf:
         Cells are a quarter of the side or smaller, unless floats round more than that: larger ones would move points so
         far that they come to lie in other leaves.
         """
-        return max(min(max(wanted, self.exponent - LEVELS + 1), self.exponent - 2), self.finest)
+        return max(min(max(wanted, self.exponent - MAX_TREE_LEVELS + 1), self.exponent - 2), self.finest)
 
     def codes(self, positions: np.ndarray, exponent: int) -> np.ndarray:
         """(n,) uint64 Morton codes of the cells of side 2^exponent that (n, 3) positions in the leaf lie in."""
@@ -70,7 +70,7 @@ class Leaf:
         return self.low + np.ldexp(separated(codes) + 0.5, exponent)
 
 
-def leaves(positions: np.ndarray, most: int = MOST) -> Iterator[Leaf]:
+def leaves(positions: np.ndarray, most: int = MAX_LEAF_POINTS) -> Iterator[Leaf]:
     """The leaves of an octree over (N, 3) positions, float32 or float64, each of `most` points or fewer.
 
     They come along a Morton curve. Memory beside the positions: about 32 bytes a point.
@@ -81,16 +81,16 @@ def leaves(positions: np.ndarray, most: int = MOST) -> Iterator[Leaf]:
     if not len(positions):
         return
     low, high = positions.min(0), positions.max(0)
-    if not (np.abs(np.array([low, high], np.float64)) < LARGEST).all():
+    if not (np.abs(np.array([low, high], np.float64)) < MAX_COORDINATE).all():
         raise BadInput("positions that are NaN, Inf or beyond 2^200; such a model is of no use")
     top = _top(low, high)
     first = cells(low[None], top - 1)[0]
     largest = max(abs(int(index) + more) for index in first for more in (0, 2))
     finest = top - 1 + (largest - 1).bit_length() - DIGITS[positions.dtype.itemsize]
-    depth = max(1, min(LEVELS, top - finest))
+    depth = max(1, min(MAX_TREE_LEVELS, top - finest))
     codes = np.empty(len(positions), np.uint64)
-    for start in range(0, len(positions), MOST):
-        part = slice(start, start + MOST)
+    for start in range(0, len(positions), MAX_LEAF_POINTS):
+        part = slice(start, start + MAX_LEAF_POINTS)
         codes[part] = interleaved(cells(positions[part], top - depth) - (first << (depth - 1)))
     order = np.argsort(codes, kind="stable")
     codes = codes[order]
@@ -108,7 +108,7 @@ def leaves(positions: np.ndarray, most: int = MOST) -> Iterator[Leaf]:
         leaf = Leaf(top - level, tuple(corner.tolist()), finest)
         for begin in range(start, stop, most):
             rows = order[begin : min(begin + most, stop)]
-            fine = leaf.codes(positions[rows], leaf.cell_exponent(leaf.exponent - LEVELS))
+            fine = leaf.codes(positions[rows], leaf.cell_exponent(leaf.exponent - MAX_TREE_LEVELS))
             yield Leaf(leaf.exponent, leaf.corner, finest, rows[np.argsort(fine, kind="stable")])
 
     yield from below(0, 0, 0, len(positions))
@@ -130,7 +130,7 @@ def _top(low: np.ndarray, high: np.ndarray) -> int:
     return exponent + 1
 
 
-_SPREAD = (
+_BIT_SPREADING = (
     (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )  # fmt: skip
@@ -142,7 +142,7 @@ def interleaved(numbers: np.ndarray) -> np.ndarray:
     code = np.zeros(len(numbers), np.uint64)
     for axis in range(3):
         bits = numbers[:, axis].astype(np.uint64)
-        for shift, mask in _SPREAD:
+        for shift, mask in _BIT_SPREADING:
             bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
         code |= bits << np.uint64(axis)
     return code
@@ -152,8 +152,8 @@ def separated(codes: np.ndarray) -> np.ndarray:
     """(N, 3) int64 numbers of Morton codes."""
     found = []
     for axis in range(3):
-        bits = (codes >> np.uint64(axis)) & np.uint64(_SPREAD[-1][1])
-        for (shift, _), (_, mask) in zip(_SPREAD[::-1], [*_SPREAD[-2::-1], (0, 0x1FFFFF)], strict=True):
+        bits = (codes >> np.uint64(axis)) & np.uint64(_BIT_SPREADING[-1][1])
+        for (shift, _), (_, mask) in zip(_BIT_SPREADING[::-1], [*_BIT_SPREADING[-2::-1], (0, 0x1FFFFF)], strict=True):
             bits = (bits | (bits >> np.uint64(shift))) & np.uint64(mask)
         found.append(bits.astype(np.int64))
     return np.stack(found, 1)

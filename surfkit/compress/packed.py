@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.base import Compressor, Plan, kinds_of
-from surfkit.compress.colors import COLUMNS, PrincipalComponents, principal_components, vectors
+from surfkit.compress.colors import SH_COLUMNS, PrincipalComponents, principal_components, vectors
 from surfkit.compress.encoding import ColumnType, Encoding
 from surfkit.compress.plain import exact
-from surfkit.compress.scalars import Cells, Levels, LogSteps, SmallestThree
+from surfkit.compress.scalars import LogSteps, MortonPositions, SmallestThree, UniformLevels
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import EXP
 from surfkit.primitives.model import SplatModel
 
-SAMPLE = 1 << 18
+PCA_POINTS = 1 << 18
 """Points that principal components are found from."""
 
 
@@ -57,10 +57,10 @@ class Packed(Compressor):
         """See `Compressor.plan`."""
         kinds, tables = kinds_of(model), {}
         found = shape_encodings(model, self.position, self.scale, self.rotation, self.opacity)
-        if set(COLUMNS) <= set(kinds):
-            step = max(1, len(model) // SAMPLE)
-            tables = principal_components(vectors({name: model.params[name][::step] for name in COLUMNS}))
-            found[COLUMNS] = PrincipalComponents(self.color)
+        if set(SH_COLUMNS) <= set(kinds):
+            step = max(1, len(model) // PCA_POINTS)
+            tables = principal_components(vectors({name: model.params[name][::step] for name in SH_COLUMNS}))
+            found[SH_COLUMNS] = PrincipalComponents(self.color)
         return Plan(encodings_of(kinds, found), tables)
 
 
@@ -75,13 +75,13 @@ def shape_encodings(
         scale, rotation, opacity: See `Packed`.
     """
     kinds, found = kinds_of(model), {}
-    found["means",] = Cells("means", None if position is None else position_exponent(model, position, scale))
+    found["means",] = MortonPositions("means", None if position is None else position_exponent(model, position, scale))
     if "scales" in kinds and _are_lengths(model, kinds["scales"]):
         found["scales",] = LogSteps("scales", scale)
     if kinds.get("quats", ColumnType(())).shape == (4,):
         found["quats",] = SmallestThree("quats", min(rotation, 0.25))
     if "opacities" in kinds and _within_0_and_1(model, kinds["opacities"]):
-        found["opacities",] = Levels("opacities", int(min(max(round(1 / opacity), 2), 65_536)))
+        found["opacities",] = UniformLevels("opacities", int(min(max(round(1 / opacity), 2), 65_536)))
     return found
 
 

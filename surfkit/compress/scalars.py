@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, multiples, stream
-from surfkit.compress.octree import BITS, Leaf
+from surfkit.compress.octree import LEAF_POSITION_BITS, Leaf
 from surfkit.compress.streams import Streams
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import EXP
 from surfkit.primitives.points import Columns
 
-FLOATS = {"float16": np.float16, "float32": np.float32, "float64": np.float64}
+FLOAT_TYPES = {"float16": np.float16, "float32": np.float32, "float64": np.float64}
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Floats(OneColumn, Encoding):
     """float16, float32 or float64."""
 
     def __post_init__(self) -> None:
-        if self.kind not in FLOATS:
-            raise BadInput(f"encoding floats: kind is {self.kind!r}; it must be {', '.join(FLOATS)}")
+        if self.kind not in FLOAT_TYPES:
+            raise BadInput(f"encoding floats: kind is {self.kind!r}; it must be {', '.join(FLOAT_TYPES)}")
 
     def encode(self, values: Columns, kinds: Mapping[str, ColumnType], leaf: Leaf, tables: Tables) -> Streams:
         """See `Encoding.encode`."""
@@ -56,7 +56,7 @@ class Floats(OneColumn, Encoding):
 
 
 @dataclass(frozen=True)
-class Cells(OneColumn, Encoding):
+class MortonPositions(OneColumn, Encoding):
     """Positions as cubes along a Morton curve, by the number of cubes from one to the next.
 
     A position comes back as the centre of its cube: off by `bound` on each axis, and by the rounding of its float.
@@ -68,7 +68,7 @@ class Cells(OneColumn, Encoding):
 
     def side(self, leaf: Leaf) -> int:
         """The side of the cubes in a leaf is 2^side."""
-        return leaf.cell_exponent(leaf.exponent - BITS if self.exponent is None else self.exponent)
+        return leaf.cell_exponent(leaf.exponent - LEAF_POSITION_BITS if self.exponent is None else self.exponent)
 
     def bound(self, leaf: Leaf) -> float:
         """How far from its place a position may come back, on each axis, local units."""
@@ -125,7 +125,7 @@ class LogSteps(OneColumn, Encoding):
 
 
 @dataclass(frozen=True)
-class Levels(OneColumn, Encoding):
+class UniformLevels(OneColumn, Encoding):
     """Activated values from 0 to 1 as evenly spaced levels: they come back off by 1 / (2 levels) at most."""
 
     column: str = "opacities"
@@ -209,7 +209,7 @@ class SmallestThree(OneColumn, Encoding):
 def float_bits(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
     """(n, width) floats as unsigned numbers of the same bits."""
     with np.errstate(over="ignore"):
-        rounded = numbers.astype(FLOATS[kind])
+        rounded = numbers.astype(FLOAT_TYPES[kind])
     if not np.isfinite(rounded).all():
         raise BadInput(f"{name}: values beyond what {kind} holds; choose compress:lossless")
     return np.frombuffer(rounded.tobytes(), f"<u{rounded.dtype.itemsize}").reshape(rounded.shape)
@@ -217,7 +217,7 @@ def float_bits(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
 
 def bits_float(bits: np.ndarray, kind: str) -> np.ndarray:
     """The floats of `float_bits`."""
-    floats = FLOATS[kind]
+    floats = FLOAT_TYPES[kind]
     if bits.dtype.itemsize != np.dtype(floats).itemsize:
         raise BadInput(f"a stream of {kind} has numbers of {bits.dtype.itemsize} bytes")
     return np.frombuffer(bits.tobytes(), floats).reshape(bits.shape)

@@ -13,7 +13,7 @@ docs/surfkit_file.md describes the bytes.
              for a plane that is stored as it is
     then the planes, one after the other, as Zstandard frames with their size
 
-All numbers are little endian and unsigned. Planes of more than `MOST_EMPTY` rows are never left out, so that nobody
+All numbers are little endian and unsigned. Planes of more than `MAX_EMPTY_ROWS` rows are never left out, so that nobody
 needs more than about 2^17 times the memory of the bytes that are read.
 """
 
@@ -27,13 +27,13 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 
-LEVEL = 15
+ZSTD_LEVEL = 15
 """Of Zstandard."""
 AS_IT_IS = 1 << 31
-MOST_COMPONENTS = 4096
-MOST_EMPTY = 1 << 17
+MAX_COMPONENTS = 4096
+MAX_EMPTY_ROWS = 1 << 17
 """Rows of a plane that takes no room."""
-MOST_ROWS_A_BYTE = 1 << 15
+MAX_ROWS_PER_BYTE = 1 << 15
 """Of a Zstandard frame: it repeats a byte at most so often for each of its own."""
 
 
@@ -78,7 +78,7 @@ class Stored:
         if coded:
             try:
                 size = zstandard.frame_content_size(part)
-                if size == self.shape[0] <= MOST_EMPTY + MOST_ROWS_A_BYTE * len(part):
+                if size == self.shape[0] <= MAX_EMPTY_ROWS + MAX_ROWS_PER_BYTE * len(part):
                     part = zstandard.ZstdDecompressor().decompress(part, allow_extra_data=False)
                 else:
                     part = part[:0]
@@ -97,13 +97,13 @@ def packed(streams: Mapping[str, np.ndarray]) -> bytes:
     """The bytes of arrays, each (rows, components) of an unsigned type."""
     import zstandard
 
-    coder = zstandard.ZstdCompressor(level=LEVEL)
+    coder = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
     head, body = [struct.pack("<B", len(streams))], []
     for name, numbers in streams.items():
-        if numbers.dtype.kind != "u" or numbers.ndim != 2 or numbers.shape[1] > MOST_COMPONENTS:
+        if numbers.dtype.kind != "u" or numbers.ndim != 2 or numbers.shape[1] > MAX_COMPONENTS:
             raise TypeError(
                 f"stream {name}: {numbers.dtype} {numbers.shape}; it must be unsigned, with two axes and at most "
-                f"{MOST_COMPONENTS} components"
+                f"{MAX_COMPONENTS} components"
             )
         rows, components = numbers.shape
         size = numbers.dtype.itemsize
@@ -111,7 +111,7 @@ def packed(streams: Mapping[str, np.ndarray]) -> bytes:
         head.append(struct.pack("<B", len(title)) + title + struct.pack("<BII", size, components, rows))
         split = np.ascontiguousarray(numbers.astype(f"<u{size}", copy=False).T).view(np.uint8)
         for plane in split.reshape(components, rows, size).transpose(0, 2, 1).reshape(components * size, rows):
-            if rows <= MOST_EMPTY and not plane.any():
+            if rows <= MAX_EMPTY_ROWS and not plane.any():
                 head.append(struct.pack("<I", 0))
                 continue
             plain = plane.tobytes()
@@ -135,7 +135,7 @@ def unpacked(data: bytes | memoryview, most_rows: int) -> dict[str, Stored]:
             name = bytes(data[at + 1 : at + 1 + length]).decode()
             size, components, rows = struct.unpack_from("<BII", data, at + 1 + length)
             at += 1 + length + 9
-            if size not in (1, 2, 4, 8) or components > MOST_COMPONENTS or rows > most_rows or name in found:
+            if size not in (1, 2, 4, 8) or components > MAX_COMPONENTS or rows > most_rows or name in found:
                 raise BadInput(f"stream {name!r} has {rows} x {components} numbers of {size} bytes, or is there twice")
             found[name] = (size, components, rows, np.frombuffer(data, "<u4", components * size, at))
             at += 4 * components * size
@@ -148,7 +148,7 @@ def unpacked(data: bytes | memoryview, most_rows: int) -> dict[str, Stored]:
         start, at = at, at + int((lengths & np.uint32(~AS_IT_IS & 0xFFFFFFFF)).sum(dtype=np.int64))
         if at > len(data):
             raise BadInput(f"stream {name} is cut off")
-        if rows > MOST_EMPTY and not lengths.all():
+        if rows > MAX_EMPTY_ROWS and not lengths.all():
             raise BadInput(f"stream {name} of {rows} rows lacks a plane")
         streams[name] = Stored(name, np.dtype(f"<u{size}"), (rows, components), data[start:at], lengths)
     if at != len(data):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.base import Compressor, Plan, kinds_of
-from surfkit.compress.colors import CHOSEN, COLUMNS, Codes, vectors, width
+from surfkit.compress.colors import CHOSEN_MARK, SH_COLUMNS, Codes, vectors, width
 from surfkit.compress.encoding import Tables
 from surfkit.compress.kmeans import kmeans, nearest
 from surfkit.compress.packed import encodings_of, shape_encodings
@@ -19,11 +19,11 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.primitives.model import SplatModel
 
-PASSES = 10
+KMEANS_PASSES = 10
 """Of k-means."""
-PIECE = 1 << 18
+BATCH_POINTS = 1 << 18
 """Points whose codes are searched for at once."""
-LEARNT_FROM = 1 << 20
+CODEBOOK_POINTS = 1 << 20
 """Points that a codebook is learnt from, so that memory does not grow with the model."""
 
 
@@ -73,16 +73,16 @@ class Vectree(Compressor):
     ) -> Plan:
         """See `Compressor.plan`."""
         kinds = kinds_of(model)
-        if not set(COLUMNS) <= set(kinds):
-            raise BadInput(f"compress:vectree needs the columns {' and '.join(COLUMNS)}; choose compress:packed")
+        if not set(SH_COLUMNS) <= set(kinds):
+            raise BadInput(f"compress:vectree needs the columns {' and '.join(SH_COLUMNS)}; choose compress:packed")
         if importance is None:
             raise BadInput("compress:vectree needs the contributions to training views; choose compress:packed")
         chosen = least(importance, self.ratio)
         rows = chosen.nonzero()[:, 0]
-        if len(rows) > LEARNT_FROM:
+        if len(rows) > CODEBOOK_POINTS:
             draw = torch.Generator().manual_seed(seed)
-            rows = rows[torch.randperm(len(rows), generator=draw)[:LEARNT_FROM].sort().values]
-        numbers = vectors({name: model.params[name][rows] for name in COLUMNS})
+            rows = rows[torch.randperm(len(rows), generator=draw)[:CODEBOOK_POINTS].sort().values]
+        numbers = vectors({name: model.params[name][rows] for name in SH_COLUMNS})
         weights = importance[rows].float()
         parts = self.parts(width(kinds))
         ends = np.cumsum([0, *parts]).tolist()
@@ -90,9 +90,9 @@ class Vectree(Compressor):
             f"sh.codes.{at}": codebook(numbers[:, start:stop], self.codes, weights, seed, f"codebook {at + 1}", device)
             for at, (start, stop) in enumerate(zip(ends, ends[1:], strict=False))
         }
-        found = shape_encodings(model, None, self.scale, self.rotation, self.opacity) | {COLUMNS: Codes(parts)}
+        found = shape_encodings(model, None, self.scale, self.rotation, self.opacity) | {SH_COLUMNS: Codes(parts)}
         return Plan(
-            encodings_of(kinds, found), tables, {CHOSEN: chosen} | find_codes(model, chosen, parts, tables, device)
+            encodings_of(kinds, found), tables, {CHOSEN_MARK: chosen} | find_codes(model, chosen, parts, tables, device)
         )
 
     def parts(self, coefficients: int) -> tuple[int, ...]:
@@ -117,8 +117,8 @@ def find_codes(
     found = {f"sh.code.{at}": torch.zeros(len(model), dtype=torch.int32) for at in range(len(parts))}
     ends, rows = np.cumsum([0, *parts]).tolist(), chosen.nonzero()[:, 0]
     done = 0
-    for some in rows.split(PIECE):
-        numbers = vectors({name: model.params[name][some] for name in COLUMNS})
+    for some in rows.split(BATCH_POINTS):
+        numbers = vectors({name: model.params[name][some] for name in SH_COLUMNS})
         for marks, book, start, stop in zip(found.values(), books, ends, ends[1:], strict=False):
             wanted = torch.from_numpy(np.ascontiguousarray(numbers[:, start:stop], np.float32))
             marks[some] = nearest(wanted, book, device)[0]
@@ -142,7 +142,7 @@ def codebook(
         codes,
         weights.clamp_min(1e-3),
         seed=seed,
-        iterations=PASSES,
+        iterations=KMEANS_PASSES,
         progress=lambda done, of: emit(Progress(name, done, of)),
         device=device,
     )

@@ -32,23 +32,23 @@ class Fault(RuntimeError):
     """What gave out, in a word."""
 
 
-_KEPT: ContextVar[list[BadInput] | None] = ContextVar("kept", default=None)
+_COLLECTED_ERRORS: ContextVar[list[BadInput] | None] = ContextVar("kept", default=None)
 
 
 @contextmanager
 def collecting() -> Iterator[list[BadInput]]:
     """Within, in this thread, what is rejected is only kept, in the list, and the reader goes on to find more."""
     kept: list[BadInput] = []
-    token = _KEPT.set(kept)
+    token = _COLLECTED_ERRORS.set(kept)
     try:
         yield kept
     finally:
-        _KEPT.reset(token)
+        _COLLECTED_ERRORS.reset(token)
 
 
 def reject(error: BadInput) -> None:
     """Raise an error that a reader could go on after; where faults are being collected, keep it and go on."""
-    kept = _KEPT.get()
+    kept = _COLLECTED_ERRORS.get()
     if kept is None:
         raise error
     kept.append(error)

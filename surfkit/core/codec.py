@@ -18,7 +18,7 @@ from surfkit.core.registry import Component, components, find, name_of
 _JSON_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 _NON_FINITE = ("inf", "-inf", "nan")
 """How floats that JSON lacks are written."""
-MOST_NESTED = 100
+MAX_NESTING_DEPTH = 100
 """Objects and lists within one another that are read: more has no meaning here, and recursion would end at a number
 that depends on who calls."""
 
@@ -94,7 +94,7 @@ def from_json(text: str) -> Any:
     """What a JSON text says. All JSON that is not of this process comes through here.
 
     Raises:
-        BadInput: Not JSON, a key twice in an object, or nested more than `MOST_NESTED` deep.
+        BadInput: Not JSON, a key twice in an object, or nested more than `MAX_NESTING_DEPTH` deep.
     """
     try:
         data = json.loads(text, object_pairs_hook=_object)
@@ -105,11 +105,11 @@ def from_json(text: str) -> Any:
     except ValueError as error:  # BadInput, a number of thousands of digits
         raise BadInput(f"not JSON: {error}") from error
     inner = [data]
-    for _ in range(MOST_NESTED):
+    for _ in range(MAX_NESTING_DEPTH):
         inner = [item for one in inner for item in _items(one) if isinstance(item, (dict, list))]
         if not inner:
             return data
-    raise BadInput(f"not JSON: nested too deeply; {MOST_NESTED} levels are allowed")
+    raise BadInput(f"not JSON: nested too deeply; {MAX_NESTING_DEPTH} levels are allowed")
 
 
 def read_keys(path: Path, hints: Mapping[str, Any], remedy: str) -> dict[str, Any]:

@@ -194,22 +194,22 @@ _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""
 
 
-_AGAIN: ContextVar[bool] = ContextVar("again", default=False)
+_READING_AGAIN: ContextVar[bool] = ContextVar("again", default=False)
 
 
 @contextmanager
 def reading_again() -> Iterator[None]:
     """Within, in this thread, nobody hears warnings: they were told when the same files were read before."""
-    token = _AGAIN.set(True)
+    token = _READING_AGAIN.set(True)
     try:
         yield
     finally:
-        _AGAIN.reset(token)
+        _READING_AGAIN.reset(token)
 
 
 def emit(event: Any) -> None:
     """Tell every plugin what happened. One that raises is reported on stderr and not asked again: logs kill no run."""
-    if _AGAIN.get() and isinstance(event, Warned):
+    if _READING_AGAIN.get() and isinstance(event, Warned):
         return
     for impl in plugins().hook.surfkit_event.get_hookimpls():
         key = (impl.plugin_name, id(impl.plugin))

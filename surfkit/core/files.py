@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-MARK = ".surfkit-"
+FILE_PREFIX = ".surfkit-"
 """What names of files begin with that are surely ours, in folders that hold files of others too."""
-UNFINISHED = f"{MARK}*.part"
+UNFINISHED_PATTERN = f"{FILE_PREFIX}*.part"
 """Names of files and folders that are being written."""
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """Errors of a disk that has no room."""
@@ -70,7 +70,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
 
 def being_written(path: Path) -> Path:
     """Where this thread writes what is to take the place of a file or folder; `sweep` deletes what is left of it."""
-    return path.with_name(f"{MARK}{path.name}.{os.getpid()}-{threading.get_native_id()}.part")
+    return path.with_name(f"{FILE_PREFIX}{path.name}.{os.getpid()}-{threading.get_native_id()}.part")
 
 
 def remove(path: Path) -> None:
@@ -119,7 +119,7 @@ def sweep(folder: Path, but: Path | None = None, deep: bool = True) -> None:
 
     `deep`: also in the folders inside, linked ones left out.
     """
-    for path in list(folder.rglob(UNFINISHED) if deep else folder.glob(UNFINISHED)):
+    for path in list(folder.rglob(UNFINISHED_PATTERN) if deep else folder.glob(UNFINISHED_PATTERN)):
         if but is None or not path.is_relative_to(but):
             remove(path)
 

@@ -16,19 +16,19 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json, read_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.files import MARK
+from surfkit.core.files import FILE_PREFIX
 
-NAME = f"{MARK}lock"
-FORMER = "lock"
+LOCK_FILE = f"{FILE_PREFIX}lock"
+FORMER_LOCK_FILE = "lock"
 """So processes of older versions call it, which are waited for; a file of that name may also be the user's own."""
-USED = "in-use"
+IN_USE_FILE = "in-use"
 """File of a folder that several processes may use at once; its time is when one last began to."""
 DAY_S = 86_400
-HERE = os.O_NOFOLLOW | os.O_NONBLOCK
+NO_FOLLOW_FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK
 """How a file is opened that somebody else may have put there: no link is followed, no pipe waited for."""
-PATIENCE_S = 0.5
+LOCK_TIMEOUT_S = 0.5
 """How long to ask again: a process that only looks (`lock_holder`) has the lock for a moment."""
-LONGEST = 4096
+MAX_LOCK_BYTES = 4096
 """Bytes that the file of a lock may have."""
 
 
@@ -41,12 +41,12 @@ def locked(folder: Path) -> Iterator[None]:
     """
     made = _make(folder)
     try:
-        file = _lock(folder / NAME, folder)
+        file = _lock(folder / LOCK_FILE, folder)
         try:
             yield
         finally:
             if file is not None:
-                (folder / NAME).unlink(missing_ok=True)
+                (folder / LOCK_FILE).unlink(missing_ok=True)
                 os.close(file)
     finally:
         with suppress(OSError):  # what is not empty stays
@@ -56,14 +56,16 @@ def locked(folder: Path) -> Iterator[None]:
 
 def lock_holder(folder: Path) -> str | None:
     """The process that has locked a folder, as "process PID on HOST"; None if none has."""
-    return next((holder for name in (NAME, FORMER) if (holder := _holder(folder / name)) is not None), None)
+    return next(
+        (holder for name in (LOCK_FILE, FORMER_LOCK_FILE) if (holder := _holder(folder / name)) is not None), None
+    )
 
 
 def _holder(path: Path) -> str | None:
     import fcntl
 
     try:
-        file = os.open(path, os.O_RDONLY | HERE)
+        file = os.open(path, os.O_RDONLY | NO_FOLLOW_FLAGS)
     except OSError:
         return None
     try:
@@ -81,7 +83,7 @@ def mark_used(folder: Path) -> Iterator[None]:
     import fcntl
 
     try:
-        file = os.open(folder / USED, os.O_RDWR | os.O_CREAT | HERE, 0o666)
+        file = os.open(folder / IN_USE_FILE, os.O_RDWR | os.O_CREAT | NO_FOLLOW_FLAGS, 0o666)
     except OSError as error:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
             raise
@@ -101,7 +103,7 @@ def is_used(folder: Path) -> bool:
     import fcntl
 
     try:
-        file = os.open(folder / USED, os.O_RDWR | HERE)
+        file = os.open(folder / IN_USE_FILE, os.O_RDWR | NO_FOLLOW_FLAGS)
     except FileNotFoundError:
         return False
     try:
@@ -126,9 +128,9 @@ def _lock(path: Path, folder: Path) -> int | None:
     """The open, locked file; None where the file system has no locks."""
     import fcntl
 
-    if (holder := _holder(folder / FORMER)) is not None:
+    if (holder := _holder(folder / FORMER_LOCK_FILE)) is not None:
         raise _in_use(folder, holder)
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + LOCK_TIMEOUT_S
     while True:
         file = _opened(path)
         try:
@@ -146,7 +148,7 @@ def _lock(path: Path, folder: Path) -> int | None:
                 raise
             if time.monotonic() > until:
                 raise _in_use(folder, _named(path)) from error
-            time.sleep(PATIENCE_S / 10)
+            time.sleep(LOCK_TIMEOUT_S / 10)
         else:
             os.close(file)  # the one before had deleted it by the time we had it
 
@@ -158,12 +160,12 @@ def _opened(path: Path) -> int:
         BadInput: There is something that surfkit has not made: a link, a folder, a file with anything else in it.
     """
     try:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | HERE, 0o666)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | NO_FOLLOW_FLAGS, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             raise _foreign(path) from error
         raise
-    if not stat.S_ISREG(os.fstat(file).st_mode) or not _is_ours(os.pread(file, LONGEST + 1, 0)):
+    if not stat.S_ISREG(os.fstat(file).st_mode) or not _is_ours(os.pread(file, MAX_LOCK_BYTES + 1, 0)):
         os.close(file)
         raise _foreign(path)
     return file

@@ -41,7 +41,7 @@ class Component(ABC):  # noqa: B024 (the methods are those of each kind)
 C = TypeVar("C", bound=Component)
 
 
-KINDS = {
+HOOK_VALUES = {
     "surfkit_recipes": "a surfkit.Recipe",
     "surfkit_tables": "a surfkit.Table",
     "surfkit_rows": "a tuple of surfkit.Row",
@@ -281,11 +281,11 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
     """Refuse what could not be named, saved or shared."""
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
         raise BadInput(f"{name!r} is not a name in kebab-case (lower-case letters, digits, single hyphens)")
-    if hook in KINDS:
+    if hook in HOOK_VALUES:
         items = list(value) if hook == "surfkit_rows" and isinstance(value, (tuple, list)) else [value]
         wrong = [item for item in items if not is_dataclass(item) or isinstance(item, type)]
         if wrong or (hook == "surfkit_rows" and items == [value]):
-            raise BadInput(f"{name!r} is {repr(value)[:80]}, and not {KINDS[hook]}")
+            raise BadInput(f"{name!r} is {repr(value)[:80]}, and not {HOOK_VALUES[hook]}")
     if hook == "surfkit_commands" and not isinstance(value, LazyCommand):
         if not (isinstance(value, type) and is_dataclass(value) and callable(getattr(value, "run", None))):
             raise BadInput(

@@ -16,16 +16,16 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import sweep
-from surfkit.core.lock import NAME as LOCK
+from surfkit.core.lock import LOCK_FILE as LOCK
 
 T = TypeVar("T")
-RECORD = "stages.json"
-KEY = "unfinished.json"
+STAGES_RECORD = "stages.json"
+UNFINISHED_FILE = "unfinished.json"
 """What the parts in a folder belong to."""
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageRecord:
     """A stage that is complete.
 
     Attributes:
@@ -39,13 +39,13 @@ class Stage:
     complete: bool = True
 
 
-class Stages:
+class StageFolder:
     """The stages of a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         try:
-            self.known = read_json(folder / RECORD, dict[str, Stage])
+            self.known = read_json(folder / STAGES_RECORD, dict[str, StageRecord])
         except BadInput:
             self.known = {}
 
@@ -71,8 +71,8 @@ class Stages:
             result = make()
             ended = True
         finally:
-            self.known[name] = Stage(key, round(spent + time.perf_counter() - began, 2), ended)
-            write_json(self.folder / RECORD, self.known)
+            self.known[name] = StageRecord(key, round(spent + time.perf_counter() - began, 2), ended)
+            write_json(self.folder / STAGES_RECORD, self.known)
         return result
 
     def seconds(self) -> dict[str, float]:
@@ -100,14 +100,16 @@ def kept_parts(folder: Path, key: str) -> Iterator[None]:
     if folder.is_symlink():
         raise BadInput(f"{folder}: a link, where surfkit makes and deletes a folder; move it away")
     folder.mkdir(parents=True, exist_ok=True)
-    ours = (folder / KEY).exists()
+    ours = (folder / UNFINISHED_FILE).exists()
     sweep(folder, deep=ours)
     if ours and _key(folder) != key:
         emit(Warned(f"{folder}: what an interrupted command left there is of other inputs or settings; begun anew"))
         delete_parts(folder)
     elif not ours and _parts(folder):
-        raise BadInput(f"{folder}: it has files but no {KEY}, so they are not surfkit's; move the folder away")
-    write_json(folder / KEY, {"key": key})
+        raise BadInput(
+            f"{folder}: it has files but no {UNFINISHED_FILE}, so they are not surfkit's; move the folder away"
+        )
+    write_json(folder / UNFINISHED_FILE, {"key": key})
     try:
         yield
         delete_parts(folder)
@@ -127,10 +129,10 @@ def delete_parts(folder: Path) -> None:
 
 def _key(folder: Path) -> str | None:
     try:
-        return read_json(folder / KEY, dict[str, str]).get("key")
+        return read_json(folder / UNFINISHED_FILE, dict[str, str]).get("key")
     except BadInput:
         return None
 
 
 def _parts(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.name not in (KEY, LOCK)]
+    return [path for path in folder.iterdir() if path.name not in (UNFINISHED_FILE, LOCK)]

@@ -6,9 +6,9 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap, Elongation
-from surfkit.densify.limited import Limited
+from surfkit.densify.limited import PointCap
 from surfkit.densify.matched import MatchedADC
-from surfkit.densify.prune import Faint, Importance
+from surfkit.densify.prune import PruneByImportance, PruneByOpacity
 from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.densify.trim import Trim
 
@@ -19,12 +19,12 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     return {
         "adc": ADC,
         "matched-adc": MatchedADC,
-        "limited": Limited,
+        "limited": PointCap,
         "elongation": Elongation,
         "count-cap": CountCap,
         "loss-gradient": LossGradient,
         "abs-gradient": AbsGradient,
         "trim": Trim,
-        "importance": Importance,
-        "opacity": Faint,
+        "importance": PruneByImportance,
+        "opacity": PruneByOpacity,
     }

@@ -17,7 +17,7 @@ from surfkit.primitives.base import SHRINK
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 
-GRAD, SEEN, SIZE, SIGNED = "adc/grad", "adc/seen", "adc/size", "adc/signed"
+GRAD_STAT, SEEN_STAT, SIZE_STAT, SIGNED_STAT = "adc/grad", "adc/seen", "adc/size", "adc/signed"
 START_STRETCH, EVERY_STRETCH = 15.0, 30.0
 """How much longer than their share of a short run its first steps without an edit and its pauses between edits may be.
 Of the default `until`, 15,000, 500 times 15 are a half, and 100 times 30 a fifth: two edits. On examples/boruszyn at
@@ -86,17 +86,17 @@ class ADC(Densify):
         """Sum the signal and count the views, from one edit to the next."""
         if step.index >= self.until:
             return
-        names = [GRAD, SEEN] + [SIZE] * (self.cull_screen > 0) + [SIGNED] * self.needs_absolute
+        names = [GRAD_STAT, SEEN_STAT] + [SIZE_STAT] * (self.cull_screen > 0) + [SIGNED_STAT] * self.needs_absolute
         columns = {name: points.stat(name) for name in names}
         if self.is_due(step.index - 1):
             for column in columns.values():
                 column.zero_()
-        columns[GRAD].add_(step.grad_norm)
-        columns[SEEN].add_(step.seen)
+        columns[GRAD_STAT].add_(step.grad_norm)
+        columns[SEEN_STAT].add_(step.seen)
         if self.cull_screen > 0:
-            torch.maximum(columns[SIZE], step.radii / step.image_px, out=columns[SIZE])
+            torch.maximum(columns[SIZE_STAT], step.radii / step.image_px, out=columns[SIZE_STAT])
         if self.needs_absolute:
-            columns[SIGNED].add_(step.signed_norm)
+            columns[SIGNED_STAT].add_(step.signed_norm)
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Clone, split and drop every so often; reset opacities less often."""
@@ -116,7 +116,7 @@ class ADC(Densify):
             if self.cull_scale > 0:
                 drop |= torch.where(split, size / SHRINK, size) > self.cull_scale
             if self.cull_screen > 0:
-                drop |= points.stat(SIZE) > self.cull_screen
+                drop |= points.stat(SIZE_STAT) > self.cull_screen
         return Edit(drop, clone, split, self._cap(step.index))
 
     def edits(self, steps: int) -> range:
@@ -148,10 +148,10 @@ class ADC(Densify):
 
     def _hot(self, points: Points, step: Step) -> Tensor:
         """(N,) bool, points to be densified."""
-        seen = points.stat(SEEN).clamp_min(1)
-        mean, least = points.stat(GRAD) / seen, self.threshold
+        seen = points.stat(SEEN_STAT).clamp_min(1)
+        mean, least = points.stat(GRAD_STAT) / seen, self.threshold
         if self.split_threshold is not None:  # in multiples of the threshold, so that both kinds can be compared
             small = step.splats.scales.amax(-1) <= self.small
-            mean = torch.where(small, points.stat(SIGNED) / seen / self.threshold, mean / self.split_threshold)
+            mean = torch.where(small, points.stat(SIGNED_STAT) / seen / self.threshold, mean / self.split_threshold)
             least = 1.0
         return admitted(self.filters, step, mean * (mean >= least))

@@ -17,7 +17,7 @@ from surfkit.primitives.points import Points
 
 
 @dataclass(frozen=True)
-class Limited(Densify):
+class PointCap(Densify):
     """Densify as another densifier does, but never beyond a number of points.
 
     Where it asks for more clones and splits than there is room for, points drawn at random among those get theirs: what
@@ -74,6 +74,6 @@ class Limited(Densify):
         inner = self.inner.most_points
         return self.points if inner is None else min(self.points, inner)
 
-    def limited(self, points: int) -> Limited:
+    def limited(self, points: int) -> PointCap:
         """See `Densify.limited`."""
         return replace(self, points=min(self.points, points))

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.densify.adc import ADC, GRAD, SEEN
+from surfkit.densify.adc import ADC, GRAD_STAT, SEEN_STAT
 from surfkit.densify.base import Densify, Step, admitted
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 
-ABSOLUTE = "matched/absolute"
+ABSOLUTE_STAT = "matched/absolute"
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class MatchedADC(Densify):
         """Sum both gradients and count the views, from one edit to the next."""
         if step.index >= self.adc.until:
             return
-        absolute = points.stat(ABSOLUTE)
+        absolute = points.stat(ABSOLUTE_STAT)
         if self.adc.is_due(step.index - 1):
             absolute.zero_()
         absolute.add_(step.grad_norm)
@@ -59,8 +59,8 @@ class MatchedADC(Densify):
 
         The threshold of the absolute gradient is the quantile that as many points reach as the signed threshold.
         """
-        seen = points.stat(SEEN).clamp_min(1)
-        signed, absolute = points.stat(GRAD) / seen, points.stat(ABSOLUTE) / seen
+        seen = points.stat(SEEN_STAT).clamp_min(1)
+        signed, absolute = points.stat(GRAD_STAT) / seen, points.stat(ABSOLUTE_STAT) / seen
         count = int((signed >= self.adc.threshold).sum())
         if count == 0:
             return torch.zeros_like(signed)

@@ -20,7 +20,7 @@ from surfkit.raster.api import Splats
 
 
 @dataclass(frozen=True)
-class Importance(Prune):
+class PruneByImportance(Prune):
     """Drop the points of least importance (LightGaussian, Fan et al. 2023).
 
     Importance is opacity, times how much the pixels show that a point hits, times a power of the volume.
@@ -77,7 +77,7 @@ def significance(views: Views, splats: Splats, power: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Faint(Prune):
+class PruneByOpacity(Prune):
     """Drop faint points every so often, also after densification has ended."""
 
     below: float = 0.005

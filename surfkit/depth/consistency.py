@@ -32,7 +32,7 @@ def at_edge(inverse: Tensor, radius: int, share: float) -> Tensor:
     return bend > inverse * share / 2
 
 
-class Agreement(NamedTuple):
+class DepthConsistency(NamedTuple):
     """What other maps say of the pixels of a map.
 
     Attributes:
@@ -50,7 +50,9 @@ class Agreement(NamedTuple):
         return (self.count / self.shown.clamp(2, max(2, enough))).clamp_max(1)
 
 
-def agreement(camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float) -> Agreement:
+def agreement(
+    camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float
+) -> DepthConsistency:
     """How many other maps agree with each pixel.
 
     A pixel is carried into another photograph; the maps agree where the depth there differs by a share of less than
@@ -74,12 +76,12 @@ def agreement(camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Te
         *made,
         torch.get_num_threads(),
     )
-    return Agreement(*map(torch.from_numpy, made))
+    return DepthConsistency(*map(torch.from_numpy, made))
 
 
 def agreement_in_torch(
     camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float
-) -> Agreement:
+) -> DepthConsistency:
     """The same in torch: on a GPU, where surfkit has no compiled part, and to check that."""
     count, shown, ratios = torch.zeros_like(inverse), torch.zeros_like(inverse), torch.ones_like(inverse)
     for there, other in others:
@@ -93,4 +95,4 @@ def agreement_in_torch(
         shown += known
         count += agrees
         ratios += torch.where(agrees, ratio, 0)
-    return Agreement(count, shown, inverse * ratios / (count + 1))
+    return DepthConsistency(count, shown, inverse * ratios / (count + 1))

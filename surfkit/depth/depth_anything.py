@@ -17,11 +17,11 @@ from surfkit.scene.photos import read_photo
 
 LICENCES = {"small": "Apache-2.0", "base": "CC BY-NC 4.0", "large": "CC BY-NC 4.0"}
 """Of the published weights."""
-MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+CHANNEL_MEANS, CHANNEL_DEVIATIONS = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of the colours that the network was trained on."""
-PATCH = 14
+PATCH_PX = 14
 """Pixels on a side of the network's patches."""
-LARGEST = 8400
+MAX_SHORTEST_PX = 8400
 """Shortest side that is taken: what the network needs grows with its fourth power."""
 
 
@@ -43,8 +43,8 @@ class DepthAnythingV2(DepthEstimator):
     """Shortest side of the images given to the network, pixels; rounded to patches of 14."""
 
     def __post_init__(self) -> None:
-        if not PATCH <= self.shortest <= LARGEST:
-            raise BadInput(f"shortest is {self.shortest}; it must be {PATCH} to {LARGEST} pixels")
+        if not PATCH_PX <= self.shortest <= MAX_SHORTEST_PX:
+            raise BadInput(f"shortest is {self.shortest}; it must be {PATCH_PX} to {MAX_SHORTEST_PX} pixels")
 
     @property
     def source(self) -> str:
@@ -94,7 +94,7 @@ class DepthAnythingV2(DepthEstimator):
     def inverse_depth(self, network: Any, rgb: Tensor) -> Tensor:
         """(h, w) relative inverse depth of a photograph (3, H, W) in [0, 1]; 0 for what is infinitely far."""
         by = self.shortest / min(rgb.shape[1:])
-        size = [max(1, round(side * by / PATCH)) * PATCH for side in rgb.shape[1:]]
+        size = [max(1, round(side * by / PATCH_PX)) * PATCH_PX for side in rgb.shape[1:]]
         small = interpolate(rgb[None], size, mode="bicubic", antialias=True, align_corners=False)
-        mean, spread = (rgb.new_tensor(values).view(3, 1, 1) for values in (MEAN, SPREAD))
+        mean, spread = (rgb.new_tensor(values).view(3, 1, 1) for values in (CHANNEL_MEANS, CHANNEL_DEVIATIONS))
         return network(pixel_values=(small - mean) / spread).predicted_depth[0].clamp_min(0)

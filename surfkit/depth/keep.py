@@ -17,17 +17,17 @@ from surfkit.core.check import BadInput, Fault, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import DISK_FULL, sweep
-from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
+from surfkit.core.lock import IN_USE_FILE, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare import Preparation, fault_of, without_damaged
-from surfkit.io.datasets.depth_files import FOLDER, RECORD, is_whole, map_path, read_record, write_record
+from surfkit.depth.prepare import DepthPreparation, fault_of, without_damaged
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, is_whole, map_path, read_record, write_record
 from surfkit.io.datasets.fingerprint import Fingerprint, digest
-from surfkit.io.datasets.made_maps import Made, folder_of, read_made, write_made
+from surfkit.io.datasets.made_maps import DepthMapIndex, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
-from surfkit.scene.pixels import PLAIN
+from surfkit.scene.pixels import DEFAULT_PIXELS
 from surfkit.scene.scene import Scene
 
-POLL_S = 1.0
+PROCESS_POLL_S = 1.0
 """Between two looks whether another process is done."""
 DROPPED = ".dropped-"
 """What names of folders begin with that are being deleted."""
@@ -51,15 +51,15 @@ def key_of(
     for view in scene.train:
         known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
         parts += [view.name, known.camera, str(known.size), known.content, str(view.white)]
-        parts += [] if view.pixels == PLAIN else [str(view.pixels)]
+        parts += [] if view.pixels == DEFAULT_PIXELS else [str(view.pixels)]
         parts.append("" if seen is None else digest(seen))
     return digest("\0".join(parts))
 
 
 @contextmanager
 def maps(
-    preparation: Preparation, scene: Scene, tracks: Observations, key: str, budget_bytes: int
-) -> Iterator[tuple[Path, Made]]:
+    preparation: DepthPreparation, scene: Scene, tracks: Observations, key: str, budget_bytes: int
+) -> Iterator[tuple[Path, DepthMapIndex]]:
     """Within, there are maps of the training views of a scene: their folder, and what is known of them.
 
     Those that are not there, or damaged, are made; nobody deletes them meanwhile. A cache that can only be read is used
@@ -128,11 +128,11 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
                     f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, "
                     f"make them with `surfkit prepare depth {shlex.quote(str(data))}`, or do without: --no-prepare"
                 ) from error
-            time.sleep(POLL_S)
+            time.sleep(PROCESS_POLL_S)
         yield
 
 
-def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -> tuple[bool, Made]:
+def make_missing(preparation: DepthPreparation, scene: Scene, tracks: Observations) -> tuple[bool, DepthMapIndex]:
     """Make the maps that are not there, one after the other; whether there were any, and what is known of all."""
     folder, names = preparation.place, [view.name for view in scene.train]
     if broken := damaged_maps(preparation, scene):
@@ -142,7 +142,7 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
         for name in broken:
             map_path(folder, name).unlink()
     if not (is_known := has_record(folder)):
-        (folder / FOLDER / RECORD).unlink(missing_ok=True)
+        (folder / DEPTH_FOLDER / DEPTH_RECORD).unlink(missing_ok=True)
     made = read_made(folder)
     lacking = set(preparation.lacking(scene)) - set(made.without)
     count = len(names) - len(lacking) - len(made.without)
@@ -177,12 +177,12 @@ def forget_incomplete(folder: Path, scene: Scene) -> None:
     if not found or is_used(folder):
         return
     emit(Warned(f"{few(found)} could not be read before, and can be now: all depth maps are made anew"))
-    if (folder / FOLDER).exists():
-        shutil.rmtree(folder / FOLDER)
-    write_made(folder, Made())
+    if (folder / DEPTH_FOLDER).exists():
+        shutil.rmtree(folder / DEPTH_FOLDER)
+    write_made(folder, DepthMapIndex())
 
 
-def damaged_maps(preparation: Preparation, scene: Scene) -> list[str]:
+def damaged_maps(preparation: DepthPreparation, scene: Scene) -> list[str]:
     """Names of the training views whose map is there, and cannot be used."""
     paths = {view.name: map_path(preparation.place, view.name) for view in scene.train}
     oriented = preparation.estimator.oriented
@@ -196,7 +196,7 @@ def has_record(folder: Path) -> bool:
     return False
 
 
-def is_complete(preparation: Preparation, scene: Scene) -> bool:
+def is_complete(preparation: DepthPreparation, scene: Scene) -> bool:
     """Whether no map is missing or damaged."""
     lacking = set(preparation.lacking(scene)) - set(read_made(preparation.place).without)
     return not lacking and has_record(preparation.place) and not damaged_maps(preparation, scene)
@@ -232,7 +232,7 @@ def folder_bytes(folder: Path) -> int:
 def last_used(folder: Path) -> float:
     """When a run last began to use the maps in a folder."""
     with suppress(OSError):
-        return (folder / USED).stat().st_mtime
+        return (folder / IN_USE_FILE).stat().st_mtime
     return 0.0
 
 

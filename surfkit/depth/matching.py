@@ -11,14 +11,14 @@ from torch.nn.functional import grid_sample, pad
 
 from surfkit.scene.camera import Camera
 
-NOISE = 0.004
+MIN_WINDOW_DEVIATION = 0.004
 """Standard deviation of a colour, of 1, below which a window shows nothing to compare."""
-PIECE = 1 << 19
+BATCH_PIXELS = 1 << 19
 """Pixels, over all planes, that are compared at a time."""
 
 
 @dataclass(frozen=True)
-class Picture:
+class PosedImage:
     """A camera and what it saw.
 
     Attributes:
@@ -35,7 +35,7 @@ class Picture:
         return self.color.mean(0)
 
 
-def cost_volume(here: Picture, others: Sequence[Picture], planes: Tensor, window: int, visible: float) -> Tensor:
+def cost_volume(here: PosedImage, others: Sequence[PosedImage], planes: Tensor, window: int, visible: float) -> Tensor:
     """1 - correlation of windows between a picture and others warped into it through planes of one depth each.
 
     Windows are compared by zero-mean normalised cross-correlation of all colours together, so exposure does not matter,
@@ -52,11 +52,11 @@ def cost_volume(here: Picture, others: Sequence[Picture], planes: Tensor, window
     Returns:
         (D, H, W) in [0, 1].
     """
-    mean, floor = _box(here.color, window), len(here.color) * NOISE**2
+    mean, floor = _box(here.color, window), len(here.color) * MIN_WINDOW_DEVIATION**2
     contrast = _variance(here.color[None], mean[None], window) + floor
     best = max(1, round(visible * len(others)))
     volume = torch.empty(len(planes), *here.color.shape[1:], device=planes.device)
-    for part in torch.arange(len(planes), device=planes.device).split(max(1, PIECE // here.color.numel())):
+    for part in torch.arange(len(planes), device=planes.device).split(max(1, BATCH_PIXELS // here.color.numel())):
         least = [torch.ones(len(part), *here.color.shape[1:], device=planes.device) for _ in range(best)]
         for other in others:
             warped, inside = _warp(here.camera, other, planes[part])
@@ -94,7 +94,7 @@ def way_numbers(here: Camera, there: Camera) -> list[float]:
     return [number for part in ray_way(here, there) for number in part.flatten().tolist()]
 
 
-def _warp(here: Camera, other: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:
+def _warp(here: Camera, other: PosedImage, planes: Tensor) -> tuple[Tensor, Tensor]:
     """(D, C, H, W) of `other` as seen from here if all had one inverse depth; (D, H, W) where that is inside of it."""
     a, b = ray_map(here, other.camera, planes.device)
     c = planes[:, None, None]

@@ -16,16 +16,16 @@ from surfkit.core.check import BadInput
 from surfkit.raster.native import lacking, module
 from surfkit.scene.camera import Camera
 
-ENOUGH = 2000
+BRIGHTNESS_PIXELS = 2000
 """Pixels, about, by which the brightness of two pictures is compared."""
-MATCHING, FEWEST = 0.3, 50
+MAX_MATCHING_COST, MIN_MATCHING_PIXELS = 0.3, 50
 """Only pixels that match at less than this cost are used for that, if there are more than so many."""
-MOST_GAIN = 4.0
+MAX_BRIGHTNESS_GAIN = 4.0
 """Largest gain, and one over the least."""
 
 
 @dataclass(frozen=True, eq=False)
-class Grey:
+class GreyImage:
     """A camera and the grey values that it saw.
 
     Attributes:
@@ -86,7 +86,7 @@ class Planes:
 
 
 @dataclass(frozen=True)
-class Terms:
+class MatchingSettings:
     """What makes a plane good, and how far one is changed.
 
     Attributes:
@@ -119,10 +119,10 @@ class Terms:
 
 
 def improve(
-    here: Grey,
-    others: Sequence[Grey],
+    here: GreyImage,
+    others: Sequence[GreyImage],
     planes: Planes,
-    terms: Terms,
+    terms: MatchingSettings,
     seed: int,
     known: Sequence[Tensor | None] | None = None,
 ) -> None:
@@ -195,7 +195,7 @@ def from_middle(at: tuple[int, int]) -> int:
     return at[0] ** 2 + at[1] ** 2
 
 
-def gains(here: Grey, others: Sequence[Grey], planes: Planes) -> list[float]:
+def gains(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> list[float]:
     """Gain of each other picture: its grey values times this are as bright as those of `here`, whatever the exposure.
 
     The median ratio between pixels and what their planes show in the other picture; 1 where nothing is shown.
@@ -206,10 +206,10 @@ def gains(here: Grey, others: Sequence[Grey], planes: Planes) -> list[float]:
         planes: At the size of `here`; their costs by view tell which pixels match.
 
     Returns:
-        V gains, from 1 / `MOST_GAIN` to `MOST_GAIN`.
+        V gains, from 1 / `MAX_BRIGHTNESS_GAIN` to `MAX_BRIGHTNESS_GAIN`.
     """
     height, width = here.value.shape
-    step = max(1, round((height * width / ENOUGH) ** 0.5))
+    step = max(1, round((height * width / BRIGHTNESS_PIXELS) ** 0.5))
     y, x = (places.ravel() for places in np.mgrid[step // 2 : height : step, step // 2 : width : step])
     ours, found = here.value[y, x].astype(np.float64), []
     for other, match in zip(others, planes.each[y, x].T, strict=True):
@@ -219,11 +219,11 @@ def gains(here: Grey, others: Sequence[Grey], planes: Planes) -> list[float]:
         in_front = at[2] > 0
         u, v = np.rint(at[:2] / np.where(in_front, at[2], 1))
         shown = in_front & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
-        matching = shown & (match < 255 * MATCHING)
-        counts = matching if matching.sum() > FEWEST else shown
+        matching = shown & (match < 255 * MAX_MATCHING_COST)
+        counts = matching if matching.sum() > MIN_MATCHING_PIXELS else shown
         theirs = other.value[v[counts].astype(int), u[counts].astype(int)]
         ratio = float(np.median((ours[counts] + 1) / (theirs + 1.0))) if counts.any() else 1.0
-        found.append(min(max(ratio, 1 / MOST_GAIN), MOST_GAIN))
+        found.append(min(max(ratio, 1 / MAX_BRIGHTNESS_GAIN), MAX_BRIGHTNESS_GAIN))
     return found
 
 

@@ -14,13 +14,13 @@ from surfkit.scene.observations import Observations
 from surfkit.scene.parallax import degrees_between, least_apart, worth
 from surfkit.scene.scene import View
 
-SAME_SIDE = 0.8
+SAME_SIDE_LOSS = 0.8
 """Share of its weight that a view loses when another stands in the same direction: both see the same occlusions."""
-LEAST = 0.1
+MIN_PAIR_WEIGHT = 0.1
 """A pair with a weight of fewer than this many well placed points is not compared."""
-CANDIDATES = 40
+MAX_CANDIDATE_VIEWS = 40
 """Number of views, those with most shared points and not taken from the same place, that are looked at."""
-OUTLIERS = 0.01
+OUTLIER_POINT_SHARE = 0.01
 """Share of the sparse points that may lie closer than the depths tried, and farther away."""
 
 
@@ -55,7 +55,7 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
             both = np.intersect1d(seen[at], seen[other], assume_unique=True)
             if value := _worth(observations.xyz[both], centres[at], centres[other], angle):
                 worths[other] = value
-            if len(worths) == CANDIDATES:
+            if len(worths) == MAX_CANDIDATE_VIEWS:
                 break
         chosen.append(_spread(worths, {other: centres[other] - centres[at] for other in worths}, count))
         emit(Progress("choosing what to compare", at + 1, len(views)))
@@ -86,14 +86,14 @@ def depth_range(view: View, observations: Observations, margin: float) -> tuple[
     _, inverse = observations.of(view, MAX_ERROR_PX)
     if len(inverse) <= MIN_POINTS:
         return None
-    low, high = np.quantile(inverse, [OUTLIERS, 1 - OUTLIERS])
+    low, high = np.quantile(inverse, [OUTLIER_POINT_SHARE, 1 - OUTLIER_POINT_SHARE])
     more = margin * max(high - low, 0.1 * high)
     return float(max(low - more, low / 3)), float(high + more)
 
 
 def _spread(worths: dict[int, float], baselines: dict[int, np.ndarray], count: int) -> list[int]:
     """Up to `count` of the views, best first; a view in the same direction as a chosen one weighs less."""
-    left = {other: value for other, value in worths.items() if value > LEAST}
+    left = {other: value for other, value in worths.items() if value > MIN_PAIR_WEIGHT}
     chosen: list[int] = []
     while left and len(chosen) < count:
         best = max(left, key=lambda other: (left[other], -other))
@@ -102,14 +102,14 @@ def _spread(worths: dict[int, float], baselines: dict[int, np.ndarray], count: i
         for other in left:
             a, b = baselines[best], baselines[other]
             cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
-            left[other] *= 1 - SAME_SIDE * max(cosine, 0)
+            left[other] *= 1 - SAME_SIDE_LOSS * max(cosine, 0)
     return chosen
 
 
 def _nearest(xyz: np.ndarray, place: np.ndarray) -> float:
     """Distance from a place that all points but a few outliers exceed; 0 where there is no point."""
     distances = np.linalg.norm(xyz[np.isfinite(xyz).all(1)] - place, axis=1)
-    return float(np.quantile(distances, OUTLIERS)) if len(distances) else 0.0
+    return float(np.quantile(distances, OUTLIER_POINT_SHARE)) if len(distances) else 0.0
 
 
 def _worth(xyz: np.ndarray, one: np.ndarray, other: np.ndarray, angle: float) -> float:

@@ -20,29 +20,29 @@ from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.matching import ray_map
-from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
+from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
-from surfkit.depth.plane_map import Map, inverse_of, load_map, save_map
+from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 
-KEPT = 48
-"""Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
-case."""
-KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 6, 4
+MAX_CACHED_PICTURES = 48
+"""Pictures and maps kept in memory, if they take no more than `MAX_CACHED_BYTES`; those that one is compared with in
+any case."""
+MAX_CACHED_BYTES, PICTURE_PIXEL_BYTES, DEPTH_PIXEL_BYTES = 2 << 30, 6, 4
 """Of a pixel: twice as many photographs, and pictures as they are compared, of all sizes; and the depth map of each
 round."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
-FEW, MANY = 16, 32
+COARSE_WINDOW_PIXELS, FULL_WINDOW_PIXELS = 16, 32
 """Pixels of a window that are compared at first, and from the last photometric pass at full size on."""
-MATCHED, COMPARED = "matching photographs", "comparing depth maps"
+MATCHING_PHASE, COMPARING_PHASE = "matching photographs", "comparing depth maps"
 """What is done while the maps of the first round are made, and those of the others."""
-RANGES = {
+PATCH_MATCH_RANGES = {
     "longest": (32, 20_000),
     "scale": (1, 1000),
     "neighbours": (1, 16),
@@ -139,7 +139,7 @@ class PatchMatch(DepthEstimator):
     it."""
 
     def __post_init__(self) -> None:
-        require_within(RANGES, self)
+        require_within(PATCH_MATCH_RANGES, self)
         if self.window % 2 == 0:
             raise BadInput(f"window is {self.window}; it must be an odd number of pixels, so that it has a middle")
         if self.best > self.neighbours:
@@ -162,13 +162,13 @@ class PatchMatch(DepthEstimator):
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
-        work = Work(self, given, pairs, wanted)
+        work = PatchMatchWorkspace(self, given, pairs, wanted)
         for at in in_turn(pairs, wanted):
             found = work.last.map(at)
             yield Estimate(at, None, None) if found is None else self.trusted(work, at, found)
             work.finish(at)
 
-    def trusted(self, work: Work, at: int, found: Map) -> Estimate:
+    def trusted(self, work: PatchMatchWorkspace, at: int, found: PlaneMap) -> Estimate:
         """What the maps of other photographs agree with, and the mean of what they say."""
         camera = work.camera(at, 0)
         depths = ((near, work.last.depth(near)) for near in work.pairs[at])
@@ -182,7 +182,7 @@ class PatchMatch(DepthEstimator):
 
 
 @dataclass(frozen=True)
-class InitialPoints(PlaneSweep):
+class InitialPlaneSweep(PlaneSweep):
     """The sweep in which planes begin; it also looks for what is nearer or further than all sparse points."""
 
     margin: float = 0.5
@@ -192,7 +192,7 @@ class InitialPoints(PlaneSweep):
         return f"give a lower coarsest, of {longest} or less"
 
 
-class Round(NamedTuple):
+class DepthMapRound(NamedTuple):
     """Maps of a data set, made when they are asked for.
 
     Attributes:
@@ -203,12 +203,12 @@ class Round(NamedTuple):
     """
 
     what: str
-    map: Callable[[int], Map | None]
+    map: Callable[[int], PlaneMap | None]
     depth: Callable[[int], Tensor | None]
     made: set[int]
 
 
-class Work:
+class PatchMatchWorkspace:
     """Pictures and maps of a data set.
 
     Maps are kept in the folder for work as long as they are needed: they are ten times as large as what comes of them.
@@ -222,18 +222,18 @@ class Work:
         for at, others in enumerate(pairs):
             for other in others:
                 self.users[other].append(at)
-        self.sweep = InitialPoints(longest=settings.coarsest)
+        self.sweep = InitialPlaneSweep(longest=settings.coarsest)
         self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
         kept, every = self.room(), range(len(pairs))
-        self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
+        self.small = lru_cache(MAX_CACHED_PICTURES)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * kept)(self.read)
         self.greys = [
             lru_cache(kept)(partial(self.halved, level)) for level in range(1 + max(map(self.levels, every), default=0))
         ]
-        self.rounds = [self.round(MATCHED, self.match, kept)]
+        self.rounds = [self.round(MATCHING_PHASE, self.match, kept)]
         for index in range(1, self.number_of_rounds):
             again, before = f", round {index}" if index > 1 else "", self.rounds[-1]
-            self.rounds.append(self.round(COMPARED + again, lambda at, of=before: self.reconcile(at, of), kept))
+            self.rounds.append(self.round(COMPARING_PHASE + again, lambda at, of=before: self.reconcile(at, of), kept))
         self.last = self.rounds[-1]
         for each in reversed(self.rounds):
             each.made.update(at for at in every if self.path(each.what, at).exists() or not self.is_needed(each, at))
@@ -243,16 +243,19 @@ class Work:
         """With the one by photometric consistency alone."""
         return 1 + self.settings.rounds if self.settings.consistency else 1
 
-    def round(self, what: str, make: Callable[[int], Map | None], kept: int) -> Round:
+    def round(self, what: str, make: Callable[[int], PlaneMap | None], kept: int) -> DepthMapRound:
         """Of maps that `make` makes, if they are not in the folder for work yet."""
         made: set[int] = set()
         found = lru_cache(1)(lambda at: self.kept(what, at, make, made))
-        return Round(what, found, lru_cache(kept)(lambda at: inverse_of(found(at), self.given.device)), made)
+        return DepthMapRound(what, found, lru_cache(kept)(lambda at: inverse_of(found(at), self.given.device)), made)
 
     def room(self) -> int:
         """How many pictures and maps are kept in memory."""
         pixels = max((c.width * c.height for c in (self.camera(at, 0) for at in range(len(self.pairs)))), default=1)
-        most = min(KEPT, KEPT_BYTES // ((PIXEL_BYTES + DEPTH_BYTES * self.number_of_rounds) * pixels))
+        most = min(
+            MAX_CACHED_PICTURES,
+            MAX_CACHED_BYTES // ((PICTURE_PIXEL_BYTES + DEPTH_PIXEL_BYTES * self.number_of_rounds) * pixels),
+        )
         return max(most, 2 + max(map(len, self.pairs), default=0))
 
     def camera(self, at: int, level: int) -> Camera:
@@ -272,21 +275,21 @@ class Work:
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels).to(torch.float32)
         return rgb.mean(0).round().to(torch.uint8)
 
-    def grey(self, at: int, level: int) -> Grey:
+    def grey(self, at: int, level: int) -> GreyImage:
         """A photograph at a level."""
         return self.greys[level](at)
 
-    def halved(self, level: int, at: int) -> Grey:
+    def halved(self, level: int, at: int) -> GreyImage:
         """The same, made anew; files are decoded once."""
         camera = self.camera(at, level)
         small = adaptive_avg_pool2d(self.value(at).to(torch.float32)[None], (camera.height, camera.width))[0]
-        return Grey(camera, small.round().to(torch.uint8).numpy())
+        return GreyImage(camera, small.round().to(torch.uint8).numpy())
 
     def path(self, what: str, at: int) -> Path:
         """Where a map is kept."""
         return self.given.work / what.replace(",", "").replace(" ", "-") / f"{at:06d}.planes"
 
-    def kept(self, what: str, at: int, make: Callable[[int], Map | None], all_made: set[int]) -> Map | None:
+    def kept(self, what: str, at: int, make: Callable[[int], PlaneMap | None], all_made: set[int]) -> PlaneMap | None:
         """A map from the folder for work, where it is put if it is not there."""
         path = self.path(what, at)
         if not path.exists():
@@ -296,7 +299,7 @@ class Work:
             emit(Progress(what, len(all_made), len(self.given.views)))
         return load_map(path)
 
-    def is_needed(self, of: Round, at: int) -> bool:
+    def is_needed(self, of: DepthMapRound, at: int) -> bool:
         """Whether anything is still to be made from a map: estimates from those of the last round, and from those of
         another one the maps of the next."""
         if of is self.last:
@@ -314,7 +317,7 @@ class Work:
                     self.path(of.what, each).unlink(missing_ok=True)
             near = near.union(*(self.pairs[each] for each in near))
 
-    def match(self, at: int) -> Map | None:
+    def match(self, at: int) -> PlaneMap | None:
         """By photometric consistency, from coarse to fine; None without neighbours, parallax or sparse points."""
         others = self.pairs[at]
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
@@ -335,18 +338,18 @@ class Work:
                 terms = replace(
                     self.terms(span, parallax),
                     jitter_px=JITTER_PX * 2 ** (passes - 1 - index),
-                    samples=MANY if level == 0 and index == passes - 1 else FEW,
+                    samples=FULL_WINDOW_PIXELS if level == 0 and index == passes - 1 else COARSE_WINDOW_PIXELS,
                     survey=index == 0 and level == self.levels(at),
                 )
                 self.improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
-        return Map(planes.value, planes.each, parallax)
+        return PlaneMap(planes.value, planes.each, parallax)
 
     def passes(self, level: int, at: int) -> int:
         """Of photometric consistency; at full size, the pass that compares depth maps stands in for the last one."""
         fewer = (level < self.levels(at)) + (level == 0 and self.settings.consistency > 0)
         return max(1, self.settings.passes - fewer)
 
-    def reconcile(self, at: int, before: Round) -> Map | None:
+    def reconcile(self, at: int, before: DepthMapRound) -> PlaneMap | None:
         """One more pass, which looks at the depth maps of the others too."""
         found = before.map(at)
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
@@ -358,12 +361,12 @@ class Work:
         terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
         there = [self.grey(near, 0) for near in self.pairs[at]]
         self.improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30 - self.rounds.index(before), known=known)
-        return Map(planes.value, planes.each, found.parallax)
+        return PlaneMap(planes.value, planes.each, found.parallax)
 
-    def terms(self, span: tuple[float, float], parallax: float) -> Terms:
+    def terms(self, span: tuple[float, float], parallax: float) -> MatchingSettings:
         """Of the pass that compares depth maps, but for the weight of that."""
         settings = self.settings
-        return Terms(
+        return MatchingSettings(
             low=span[0],
             high=span[1],
             parallax=parallax,
@@ -372,14 +375,14 @@ class Work:
             consistency=0.0,
             spread=255 * settings.spread,
             brightness=settings.brightness,
-            samples=MANY,
+            samples=FULL_WINDOW_PIXELS,
             best=settings.best,
             window=settings.window,
             survey=False,
         )
 
 
-def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:
+def parallax_of(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> float:
     """Pixels by which other pictures move, a unit of inverse depth, about the median of the planes; the mean of all."""
     middle, moves = float(np.median(planes.value[..., 0])), []
     low, high = 0.98 * middle, 1.02 * middle

@@ -16,7 +16,7 @@ from surfkit.scene.vectors import unit
 
 
 @dataclass(frozen=True)
-class Map:
+class PlaneMap:
     """The planes of one photograph.
 
     Attributes:
@@ -51,21 +51,21 @@ class Map:
         return -unit(away)
 
 
-def save_map(path: Path, found: Map | None) -> None:
+def save_map(path: Path, found: PlaneMap | None) -> None:
     """Write a map, or that there is none, into a file: three arrays one after the other, or nothing."""
     with replacing(path) as file:
         for values in (found.value, found.each, np.full(1, found.parallax, np.float32)) if found else ():
             write_array(file, values)
 
 
-def load_map(path: Path) -> Map | None:
+def load_map(path: Path) -> PlaneMap | None:
     """What `save_map` wrote."""
     with path.open("rb") as file:
         if not path.stat().st_size:
             return None
-        return Map(np.load(file), np.load(file), float(np.load(file)[0]))
+        return PlaneMap(np.load(file), np.load(file), float(np.load(file)[0]))
 
 
-def inverse_of(found: Map | None, device: torch.device) -> Tensor | None:
+def inverse_of(found: PlaneMap | None, device: torch.device) -> Tensor | None:
     """(H, W) inverse depth of a map, on a device."""
     return None if found is None else found.inverse.to(device)

@@ -16,8 +16,8 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.memory import size
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
-from surfkit.depth.matching import Picture, cost_volume, ray_map
-from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
+from surfkit.depth.matching import PosedImage, cost_volume, ray_map
+from surfkit.depth.neighbours import MAX_CANDIDATE_VIEWS, depth_range, neighbours
 from surfkit.depth.scanlines import best_planes, smooth_costs
 from surfkit.io.datasets.depth_files import save_array
 from surfkit.scene.camera import Camera
@@ -25,13 +25,13 @@ from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 
-KEPT = 64
+MAX_CACHED_PICTURES = 64
 """Pictures kept in memory."""
 VOLUME_BYTES = 16
 """For each pixel and depth: the costs, their smoothed sums, and both again turned."""
-RANGES = {
+PLANE_SWEEP_RANGES = {
     "longest": (1, 20_000),
-    "neighbours": (1, CANDIDATES),
+    "neighbours": (1, MAX_CANDIDATE_VIEWS),
     "angle": (0.01, 180),
     "step_px": (0.01, 100),
     "max_planes": (3, 10_000),
@@ -40,7 +40,7 @@ RANGES = {
     "step_cost": (1e-6, 1000),
     "jump_cost": (1e-6, 1000),
     "tolerance": (1e-6, 1),
-    "agree": (1, CANDIDATES),
+    "agree": (1, MAX_CANDIDATE_VIEWS),
 }
 """Of the settings: what is larger only costs time, which grows with the side of a window and the number of depths."""
 
@@ -94,7 +94,7 @@ class PlaneSweep(DepthEstimator):
     """Source photographs whose depth maps must agree for full confidence."""
 
     def __post_init__(self) -> None:
-        require_within(RANGES, self)
+        require_within(PLANE_SWEEP_RANGES, self)
         if self.window % 2 == 0:
             raise BadInput(f"window is {self.window}; it must be an odd number of pixels, so that it has a middle")
         if not 0 < self.visible <= 1:
@@ -109,11 +109,11 @@ class PlaneSweep(DepthEstimator):
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
 
-        @lru_cache(KEPT)
-        def picture(at: int) -> Picture:
+        @lru_cache(MAX_CACHED_PICTURES)
+        def picture(at: int) -> PosedImage:
             return self.picture(given, at)
 
-        @lru_cache(KEPT)
+        @lru_cache(MAX_CACHED_PICTURES)
         def sweep(at: int) -> tuple[Tensor, Tensor] | None:
             path = given.work / f"{at:06d}.npy"
             if not path.exists():
@@ -134,15 +134,15 @@ class PlaneSweep(DepthEstimator):
             trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
             yield Estimate(at, found.fused.cpu(), (trusted * matched).cpu())
 
-    def picture(self, given: DepthInput, at: int) -> Picture:
+    def picture(self, given: DepthInput, at: int) -> PosedImage:
         """A photograph at the working size."""
         view = given.views[at]
         camera = view.camera.fitted(self.longest)
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels)
-        return Picture(camera, rgb.to(given.device, torch.float32) / 255)
+        return PosedImage(camera, rgb.to(given.device, torch.float32) / 255)
 
     def sweep(
-        self, given: DepthInput, at: int, here: Picture, others: Sequence[Picture]
+        self, given: DepthInput, at: int, here: PosedImage, others: Sequence[PosedImage]
     ) -> tuple[Tensor, Tensor] | None:
         """(H, W) inverse depth and how well it matches, in [0, 1]; None without neighbours or sparse points."""
         span = depth_range(given.views[at], given.observations, self.margin)
@@ -158,7 +158,7 @@ class PlaneSweep(DepthEstimator):
         inner = (plane > 0) & (plane < count - 1)
         return inverse, torch.where(inner, matched, 0)
 
-    def refuse_too_large(self, here: Picture, count: int, device: torch.device) -> None:
+    def refuse_too_large(self, here: PosedImage, count: int, device: torch.device) -> None:
         """BadInput if the costs of `count` depths would not fit into memory."""
         needed = VOLUME_BYTES * count * here.camera.width * here.camera.height
         free = free_bytes() if device.type == "cpu" else torch.cuda.mem_get_info(device)[0]
@@ -173,7 +173,7 @@ class PlaneSweep(DepthEstimator):
         """What to do for maps whose longest side is no more than so many pixels."""
         return f"give --estimator.longest {longest} or less, or a lower --estimator.max-planes"
 
-    def planes(self, here: Picture, others: Sequence[Picture], span: tuple[float, float]) -> int:
+    def planes(self, here: PosedImage, others: Sequence[PosedImage], span: tuple[float, float]) -> int:
         """How many depths to try, so that no picture moves by more than a step from one to the next."""
         moves = []
         for other in others:

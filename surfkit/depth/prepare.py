@@ -22,7 +22,7 @@ from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import (
-    FOLDER,
+    DEPTH_FOLDER,
     DepthFile,
     confidence_path,
     map_path,
@@ -31,7 +31,7 @@ from surfkit.io.datasets.depth_files import (
     write_map,
     write_record,
 )
-from surfkit.io.datasets.depth_prior import TRUSTED
+from surfkit.io.datasets.depth_prior import MIN_TRUSTED_CONFIDENCE
 from surfkit.io.datasets.fingerprint import content_of, digest
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
@@ -41,7 +41,7 @@ from surfkit.scene.scene import Scene, View
 
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
 """What photographs do that are compared and give no depth."""
-MADE_FROM, PHOTOGRAPHS = "made_from", "photographs"
+MADE_FROM_KEY, PHOTOGRAPHS_KEY = "made_from", "photographs"
 """In the record: from which cameras and sparse points, as a digest, which is also a file in the folder for work; and of
 each photograph the content of its file."""
 REMEDY = "; move the folder away to have others made"
@@ -49,7 +49,7 @@ REMEDY = "; move the folder away to have others made"
 
 
 @dataclass(frozen=True)
-class Prepared:
+class EstimatedPhoto:
     """A photograph whose depth was estimated.
 
     Attributes:
@@ -64,7 +64,7 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class Preparation:
+class DepthPreparation:
     """A data set and the estimator of its depth.
 
     Attributes:
@@ -87,7 +87,7 @@ class Preparation:
     @property
     def work(self) -> Path:
         """What an interrupted estimate goes on from."""
-        return self.place / FOLDER / ".work"
+        return self.place / DEPTH_FOLDER / ".work"
 
     def views(self, scene: Scene) -> tuple[View, ...]:
         """The photographs to estimate."""
@@ -133,14 +133,15 @@ class Preparation:
             again = again or (renew and bool(before)) or not self.is_begun()
         if not again and not alike:
             raise BadInput(
-                f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
+                f"{root / DEPTH_FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
             )
         if not again and names:
             raise BadInput(
-                f"{root / FOLDER} holds depth maps made before {few(names)} {'was' if len(names) == 1 else 'were'} "
+                f"{root / DEPTH_FOLDER} holds depth maps made before {few(names)} "
+                f"{'was' if len(names) == 1 else 'were'} "
                 "changed, or replaced by other photographs of the same name; --again makes all maps anew"
             )
-        known = {} if again else before.get(PHOTOGRAPHS) or {}
+        known = {} if again else before.get(PHOTOGRAPHS_KEY) or {}
         damaged: set[str] = set()
         if again or self.lacking(scene) or not known.keys() >= {view.name for view in views}:
             given, damaged, _ = without_damaged(given)
@@ -150,14 +151,16 @@ class Preparation:
                 confidence_path(path).unlink(missing_ok=True)
                 normal_path(path).unlink(missing_ok=True)
             shutil.rmtree(self.work, ignore_errors=True)
-        now = record[PHOTOGRAPHS].items()
-        record[PHOTOGRAPHS] = {name: known.get(name, it) for name, it in now if name in known or name not in damaged}
+        now = record[PHOTOGRAPHS_KEY].items()
+        record[PHOTOGRAPHS_KEY] = {
+            name: known.get(name, it) for name, it in now if name in known or name not in damaged
+        }
         self.open(record)
         return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
 
     def is_begun(self) -> bool:
         """Whether there is something to lose: maps, of these photographs or of others, or work on some."""
-        return any((self.place / FOLDER).rglob("*.npy")) or any(self.work.rglob("*"))
+        return any((self.place / DEPTH_FOLDER).rglob("*.npy")) or any(self.work.rglob("*"))
 
     def is_outdated(self, given: DepthInput) -> bool:
         """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""
@@ -178,24 +181,24 @@ class Preparation:
         """What depth.json says of the maps."""
         views = given.views
         # Of maps in the cache, the name of the folder tells the content of photographs.
-        content = {} if self.root else {PHOTOGRAPHS: {view.name: content_of(view) for view in views}}
+        content = {} if self.root else {PHOTOGRAPHS_KEY: {view.name: content_of(view) for view in views}}
         return content | {
             "estimator": dump(self.estimator),
             "surfkit": own_version(),
             "aligned": self.estimator.aligned,
             "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
             "matched": [view.name for view in views] if self.estimator.matched else None,
-            MADE_FROM: made_from(given),
+            MADE_FROM_KEY: made_from(given),
         }
 
-    def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
+    def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[EstimatedPhoto]:
         """Estimate and save the views at the positions `wanted`, one after the other."""
         self.forget_other_work(given)
         begun = time.perf_counter()
         for estimate in self.estimator.estimate(given, wanted):
             view = given.views[estimate.at]
             coverage = self.save(view, estimate, scene)
-            yield Prepared(view, coverage, time.perf_counter() - begun)
+            yield EstimatedPhoto(view, coverage, time.perf_counter() - begun)
             begun = time.perf_counter()
         shutil.rmtree(self.work, ignore_errors=True)
 
@@ -204,7 +207,7 @@ class Preparation:
 
         Its files are named by the position of a photograph, and depend on those that it is compared with.
         """
-        found, path = made_from(given), self.work / MADE_FROM
+        found, path = made_from(given), self.work / MADE_FROM_KEY
         if not path.exists() or path.read_text() != found:
             shutil.rmtree(self.work, ignore_errors=True)
             with replacing(path) as file:
@@ -217,7 +220,7 @@ class Preparation:
         inverse: Tensor = estimate.inverse * (scene.frame.scale if self.estimator.aligned else 1.0)
         normal = None if estimate.normal is None else estimate.normal.numpy()
         write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
-        return float((estimate.confidence > TRUSTED).float().mean())
+        return float((estimate.confidence > MIN_TRUSTED_CONFIDENCE).float().mean())
 
 
 def made_from(given: DepthInput) -> str:
@@ -232,7 +235,7 @@ def made_from(given: DepthInput) -> str:
 
 def are_alike(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Whether two records differ in nothing, or in the content of photographs alone."""
-    return {**before, PHOTOGRAPHS: None} == {**now, PHOTOGRAPHS: None}
+    return {**before, PHOTOGRAPHS_KEY: None} == {**now, PHOTOGRAPHS_KEY: None}
 
 
 def replaced(before: Mapping[str, Any], now: Mapping[str, Any], views: Sequence[View]) -> list[str]:
@@ -240,8 +243,12 @@ def replaced(before: Mapping[str, Any], now: Mapping[str, Any], views: Sequence[
 
     Those that were damaged since are none of them: what was made from them is still right.
     """
-    known = before.get(PHOTOGRAPHS) or {}
-    other = [view for view in views if known.get(view.name, now[PHOTOGRAPHS][view.name]) != now[PHOTOGRAPHS][view.name]]
+    known = before.get(PHOTOGRAPHS_KEY) or {}
+    other = [
+        view
+        for view in views
+        if known.get(view.name, now[PHOTOGRAPHS_KEY][view.name]) != now[PHOTOGRAPHS_KEY][view.name]
+    ]
     return [view.name for view, fault in faults_of(other) if fault is None]
 
 
@@ -253,9 +260,9 @@ def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return "with other settings"
     if before.get("surfkit") != now["surfkit"]:
         return f"by surfkit {before.get('surfkit', 'of another version')}"
-    if MADE_FROM not in before and are_alike({**before, MADE_FROM: now[MADE_FROM]}, now):
+    if MADE_FROM_KEY not in before and are_alike({**before, MADE_FROM_KEY: now[MADE_FROM_KEY]}, now):
         return "by an earlier surfkit, which did not note of which cameras"
-    if are_alike({**before, MADE_FROM: None}, {**now, MADE_FROM: None}):
+    if are_alike({**before, MADE_FROM_KEY: None}, {**now, MADE_FROM_KEY: None}):
         return "from other cameras or sparse points"
     return "of other photographs, or of other sizes"
 
@@ -271,7 +278,7 @@ def others_warning(root: Path, maps: Iterable[DepthFile], own: DepthEstimator, l
         own: The estimator.
         longest: Longest side of the photographs, pixels.
     """
-    folder = root / FOLDER
+    folder = root / DEPTH_FOLDER
     if not all(file.path.is_relative_to(folder) for file in maps):
         return None
     before = read_record(root)

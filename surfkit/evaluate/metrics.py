@@ -8,7 +8,7 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 
-SIZES = ("peak_memory_bytes", "peak_gpu_bytes", "fps")
+OPTIONAL_NUMBERS = ("peak_memory_bytes", "peak_gpu_bytes", "fps")
 """Numbers that are there where they are known."""
 
 
@@ -27,7 +27,7 @@ def read_metrics(out: Path) -> dict[str, Any]:
     is_valid = is_valid and all(
         images.get(name, "") is None or _is_number(images.get(name)) for name in ("psnr", "ssim")
     )
-    is_valid = is_valid and all(not found.get(name) or _is_number(found[name]) for name in SIZES)
+    is_valid = is_valid and all(not found.get(name) or _is_number(found[name]) for name in OPTIONAL_NUMBERS)
     if not is_valid:
         raise BadInput(f"{path}: damaged; delete it, and the surfkit train command of the run measures again")
     return found

@@ -19,17 +19,17 @@ from surfkit.core.codec import from_json
 from surfkit.core.files import replacing
 from surfkit.scene.srgb import linear
 
-MAGIC = b"glTF"
-MOST_BYTES = (1 << 32) - 1
+GLB_MAGIC = b"glTF"
+MAX_GLB_BYTES = (1 << 32) - 1
 """A GLB file says its length in 32 bits."""
-MOST_JSON = 1 << 26
+MAX_JSON_BYTES = 1 << 26
 """Bytes of JSON that are read: a file of splats has some thousands."""
-MOST_NUMBER = 1e30
+MAX_JSON_NUMBER = 1e30
 """Larger numbers in the JSON are damage."""
-TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+ACCESSOR_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Scalars of accessors, as numpy calls them."""
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-BYTE, SHORT, INT, FLOAT = 5121, 5123, 5125, 5126
+ACCESSOR_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT, FLOAT = 5121, 5123, 5125, 5126
 """Types of components, without a sign but FLOAT."""
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views."""
@@ -38,7 +38,7 @@ UNLIT = "KHR_materials_unlit"
 
 
 @dataclass
-class Blocks:
+class GlbWriter:
     """The bytes of a file to be written, one accessor or buffer view after the other; made only while it is written.
 
     Attributes:
@@ -81,7 +81,7 @@ def linear_colors(srgb: np.ndarray) -> np.ndarray:
     return colors
 
 
-def glb(where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str) -> Iterator[bytes]:
+def glb(where: str | Path, document: dict[str, Any], blocks: GlbWriter, remedy: str) -> Iterator[bytes]:
     """A document with its bytes, as a GLB file has them, part after part.
 
     Args:
@@ -99,9 +99,9 @@ def glb(where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + (8 + blocks.length if blocks.views else 0)
-    if total > MOST_BYTES:
-        raise BadInput(f"{where}: {total} bytes; a GLB file has at most {MOST_BYTES}: {remedy}")
-    yield struct.pack("<4sII", MAGIC, 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
+    if total > MAX_GLB_BYTES:
+        raise BadInput(f"{where}: {total} bytes; a GLB file has at most {MAX_GLB_BYTES}: {remedy}")
+    yield struct.pack("<4sII", GLB_MAGIC, 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
     if blocks.views:
         yield struct.pack("<I4s", blocks.length, b"BIN\0")
     for view, make in zip(blocks.views, blocks.makers, strict=True):
@@ -110,13 +110,13 @@ def glb(where: str | Path, document: dict[str, Any], blocks: Blocks, remedy: str
         yield data + b"\0" * (-len(data) % 4)
 
 
-def write_glb(path: Path, document: dict[str, Any], blocks: Blocks, remedy: str) -> None:
+def write_glb(path: Path, document: dict[str, Any], blocks: GlbWriter, remedy: str) -> None:
     """Save what `glb` gives as a file, which appears only when it is complete."""
     with replacing(path) as file:
         file.writelines(glb(path, document, blocks, remedy))
 
 
-def read_glb(path: Path) -> Document:
+def read_glb(path: Path) -> GltfDocument:
     """The document of a GLB file.
 
     Raises:
@@ -127,7 +127,7 @@ def read_glb(path: Path) -> Document:
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     raw = memoryview(data)
-    if bytes(raw[:4]) != MAGIC:
+    if bytes(raw[:4]) != GLB_MAGIC:
         raise BadInput(f"{path}: no GLB file: it does not begin with 'glTF'; a .gltf must be made a .glb first")
     if len(raw) < 20:
         raise BadInput(f"{path}: cut off after {len(raw)} bytes; write or copy it again")
@@ -136,7 +136,7 @@ def read_glb(path: Path) -> Document:
         raise BadInput(f"{path}: version {version} of glTF; only 2 is read")
     if len(raw) < total:
         raise BadInput(f"{path}: cut off after {len(raw)} of {total} bytes; write or copy it again")
-    if kind != b"JSON" or not 20 + size <= total or size > MOST_JSON:
+    if kind != b"JSON" or not 20 + size <= total or size > MAX_JSON_BYTES:
         raise BadInput(f"{path}: damaged: it does not begin with JSON of a plausible length; write or copy it again")
     try:
         found = from_json(bytes(raw[20 : 20 + size]).decode("utf-8"))
@@ -151,11 +151,11 @@ def read_glb(path: Path) -> Document:
             if at + 8 + length > total:
                 raise BadInput(f"{path}: damaged: {length} bytes of data do not fit; write or copy it again")
             block = raw[at + 8 : at + 8 + length]
-    return Document(Path(path), found, block)
+    return GltfDocument(Path(path), found, block)
 
 
 @dataclass(frozen=True)
-class Document:
+class GltfDocument:
     """A glTF document that was read, with what every access to it has to check.
 
     Attributes:
@@ -210,21 +210,21 @@ class Document:
         """
         accessor = self.item("accessors", index)
         scalar, number, start = accessor.get("componentType"), accessor.get("count"), accessor.get("byteOffset", 0)
-        dtype = np.dtype(TYPES[scalar]) if type(scalar) is int and scalar in TYPES else None
+        dtype = np.dtype(ACCESSOR_TYPES[scalar]) if type(scalar) is int and scalar in ACCESSOR_TYPES else None
         if accessor.get("type") != kind or dtype is None:
             shown = f"{accessor.get('type')!r} of {scalar!r}"[:80]
-            raise self.fault(f"accessors[{index}] is {shown}; {kind} is needed, of one of {sorted(TYPES)}")
+            raise self.fault(f"accessors[{index}] is {shown}; {kind} is needed, of one of {sorted(ACCESSOR_TYPES)}")
         if type(number) is not int or number < 1 or (count is not None and number != count):
             wanted = f", not {count}" if count else ""
             raise self.fault(f"damaged: accessors[{index}] has {number!r} values{wanted}"[:200])
         if "sparse" in accessor or type(start) is not int or start < 0:
             raise self.fault(f"accessors[{index}] is sparse or damaged; only plain values are read")
         data, stride = self.view(accessor.get("bufferView"))
-        row = dtype.itemsize * WIDTHS[kind]
+        row = dtype.itemsize * ACCESSOR_WIDTHS[kind]
         stride = stride or row
         if stride < row or start + (number - 1) * stride + row > len(data):
             raise self.fault(f"damaged: accessors[{index}] goes beyond its data; write or copy it again")
-        shape, steps = (number, WIDTHS[kind]), (stride, dtype.itemsize)
+        shape, steps = (number, ACCESSOR_WIDTHS[kind]), (stride, dtype.itemsize)
         values = np.ndarray(shape, dtype, data, start, steps)
         if not np.isfinite(values).all():
             raise self.fault(f"damaged: accessors[{index}] has NaN or Inf; write or copy it again")
@@ -237,6 +237,6 @@ class Document:
         """(count,) float64 of a list in the JSON."""
         if not isinstance(values, Sequence) or len(values) != count:
             raise self.fault(f"damaged: {what} is no list of {count} numbers")
-        if any(type(value) not in (int, float) or not abs(value) < MOST_NUMBER for value in values):
+        if any(type(value) not in (int, float) or not abs(value) < MAX_JSON_NUMBER for value in values):
             raise self.fault(f"damaged: {what} is no list of {count} numbers")
         return np.array(values, np.float64)

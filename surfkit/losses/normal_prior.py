@@ -13,7 +13,7 @@ from surfkit.core.schedule import log_linear
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 
-SHORTEST = 1e-3
+MIN_NORMAL_LENGTH = 1e-3
 """Rendered normals whose sum over a pixel's splats is shorter point nowhere."""
 
 
@@ -53,7 +53,7 @@ class NormalPrior(Loss):
             return 0 * maps.normal.sum()
         estimated = target.prior.normal.to(maps.normal)
         square = maps.normal.square().sum(0)
-        there = (square.detach() > SHORTEST**2) & (estimated != 0).any(0)
+        there = (square.detach() > MIN_NORMAL_LENGTH**2) & (estimated != 0).any(0)
         weight = torch.where(there, target.prior.confidence * maps.alpha.detach(), 0)
         rendered = torch.where(there, maps.normal, 0) * torch.where(there, square, 1).rsqrt()
         error = torch.zeros_like(square)

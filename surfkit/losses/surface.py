@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps, log_linear
-from surfkit.io.datasets.depth_prior import KNOWN
+from surfkit.io.datasets.depth_prior import MIN_KNOWN_CONFIDENCE
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
@@ -60,7 +60,7 @@ class NormalConsistency(Loss):
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
         if self.where == "unknown" and target.prior is not None:
-            depth = torch.where(target.prior.confidence < KNOWN, depth, 0.0)
+            depth = torch.where(target.prior.confidence < MIN_KNOWN_CONFIDENCE, depth, 0.0)
         return disagreement(depth, maps.alpha, maps.normal, target.view.camera)
 
 

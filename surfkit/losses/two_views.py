@@ -15,12 +15,12 @@ from surfkit.losses.base import Neighbour
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 
-OPAQUE = 0.5
+MIN_SURFACE_ALPHA = 0.5
 """The expected depth counts as a surface where alpha is above this, as the median depth does."""
-WHOLE = 0.999
+MIN_VALID_SHARE = 0.999
 """A bilinear sample counts if at least this share of it comes from pixels that count."""
 CPU = torch.device("cpu")
-TINY = 1e-4
+MIN_DEPTH = 1e-4
 """Depths and inverse depths below this, in local units, are as good as none."""
 
 
@@ -58,7 +58,7 @@ def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:
     """(H, W) camera z of the rendered surface; 0 where there is none."""
     if which == "median":
         return maps.median
-    return torch.where(maps.alpha > OPAQUE, maps.expected_depth(), 0.0)
+    return torch.where(maps.alpha > MIN_SURFACE_ALPHA, maps.expected_depth(), 0.0)
 
 
 def spread(size: tuple[int, int], side: int, seed: int, device: torch.device = CPU) -> tuple[Tensor, Tensor]:
@@ -91,7 +91,7 @@ def motion(camera: Camera, other: Camera, like: Tensor) -> tuple[Tensor, Tensor]
 
 def projected(camera: Camera, points: Tensor) -> Tensor:
     """(2, ...) x and y in pixels of (3, ...) points of the camera's frame; those not before it fall on any place."""
-    z = torch.where(points[2] > TINY, points[2], 1.0)
+    z = torch.where(points[2] > MIN_DEPTH, points[2], 1.0)
     return torch.stack([camera.fx * points[0] / z + camera.cx, camera.fy * points[1] / z + camera.cy])
 
 
@@ -116,7 +116,7 @@ def sampled(image: Tensor, at: Tensor) -> Tensor:
 def is_whole(counts: Tensor, at: Tensor) -> Tensor:
     """(...) bool, whether all pixels (h, w) that a bilinear sample at (2, ...) takes its value from count."""
     with torch.no_grad():
-        return sampled(counts.to(at), at.detach()) > WHOLE
+        return sampled(counts.to(at), at.detach()) > MIN_VALID_SHARE
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Opposite:
     def of(cls, neighbour: Neighbour, which: Literal["median", "expected"]) -> Opposite:
         """Of the median or the expected depth."""
         surface = surface_depth(neighbour.maps, which)
-        there = surface > TINY
+        there = surface > MIN_DEPTH
         inverse = torch.where(there, 1 / torch.where(there, surface, 1.0), 0.0)
         return cls(neighbour.view.camera, inverse, there if neighbour.mask is None else there & neighbour.mask)
 
@@ -163,10 +163,10 @@ def round_trip(depth: Tensor, rays: Tensor, camera: Camera, opposite: Opposite) 
     points = rotation @ (rays * depth) + shift
     at = projected(lens, points)
     inverse = sampled(opposite.inverse, at)
-    valid = (depth > TINY) & (points[2] > TINY) & is_whole(opposite.counts, at) & (inverse > TINY)
+    valid = (depth > MIN_DEPTH) & (points[2] > MIN_DEPTH) & is_whole(opposite.counts, at) & (inverse > MIN_DEPTH)
     way = torch.stack([(at[0] - lens.cx) / lens.fx, (at[1] - lens.cy) / lens.fy, torch.ones_like(inverse)])
     back = rotation.T @ (way / torch.where(valid, inverse, 1.0) - shift)
-    valid = valid & (back[2] > TINY)
+    valid = valid & (back[2] > MIN_DEPTH)
     start = projected(camera, rays)
     square = (projected(camera, back) - start).square().sum(0)
     apart = valid & (square > 0)  # no root of 0, whose slope is infinite

@@ -12,7 +12,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.losses.base import Loss, Neighbour, Target
 from surfkit.losses.two_views import (
-    TINY,
+    MIN_DEPTH,
     Opposite,
     TwoViews,
     agreement,
@@ -27,11 +27,11 @@ from surfkit.losses.two_views import (
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 
-GREY = (0.299, 0.587, 0.114)
+GREY_WEIGHTS = (0.299, 0.587, 0.114)
 """Shares of red, green and blue in grey (ITU-R BT.601)."""
-GRAZING = 0.1
+MIN_VIEW_COSINE = 0.1
 """Planes that are seen at a smaller cosine are too oblique to warp by."""
-TEXTURE = 0.01
+MIN_PATCH_DEVIATION = 0.01
 """Patches of which grey deviates less, as a standard deviation for white 1, are noise and are not compared."""
 
 
@@ -69,7 +69,7 @@ class WarpedPatches(TwoViews, Loss):
             return nothing
         z, normal = depth.flatten()[at], maps.normal.flatten(1)[:, at]
         rays = camera.rays(depth.dtype, depth.device).flatten(1)[:, at]
-        facing = -(normal * rays).sum(0) > GRAZING * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
+        facing = -(normal * rays).sum(0) > MIN_VIEW_COSINE * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
         with torch.no_grad():
             opposite = Opposite.of(neighbour, self.depth)
             weight, counts = agreement(*round_trip(z, rays, camera, opposite), self.limit)
@@ -125,19 +125,19 @@ class WarpedPatches(TwoViews, Loss):
         points = turned + shift[:, :, None] * inverse
         at = projected(neighbour.view.camera, points)
         counts = plane.new_ones(neighbour.photo.shape[1:]) if neighbour.mask is None else neighbour.mask
-        inside = (inverse > TINY) & (points[2] > TINY) & is_whole(counts, at)
+        inside = (inverse > MIN_DEPTH) & (points[2] > MIN_DEPTH) & is_whole(counts, at)
         return sampled(grey(neighbour.photo).to(at), at), inside.all(1)
 
 
 def grey(photo: Tensor) -> Tensor:
     """(H, W) of (3, H, W)."""
-    return torch.tensordot(photo.new_tensor(GREY), photo, 1)
+    return torch.tensordot(photo.new_tensor(GREY_WEIGHTS), photo, 1)
 
 
 def ncc(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """(K,) normalised cross-correlation in [-1, 1] of the rows of (K, S), and whether both rows have texture."""
     a, b = (rows - rows.mean(1, keepdim=True) for rows in (one, other))
     first, second = a.square().mean(1), b.square().mean(1)
-    textured = (first > TEXTURE**2) & (second > TEXTURE**2)
+    textured = (first > MIN_PATCH_DEVIATION**2) & (second > MIN_PATCH_DEVIATION**2)
     scale = torch.where(textured, first * second, 1.0).sqrt()
     return torch.where(textured, (a * b).mean(1) / scale, 0.0), textured

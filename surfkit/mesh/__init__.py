@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tetra import Tetra
@@ -21,5 +21,5 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "poisson": Poisson,
         "stereo": Stereo,
         "visibility": Visibility,
-        "agreement": Agreement,
+        "agreement": GeometricConsistency,
     }

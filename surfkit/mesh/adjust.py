@@ -8,22 +8,22 @@ import numpy as np
 import torch
 
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.sights import Sights, boxes_of, for_all
+from surfkit.mesh.sights import ViewObservations, boxes_of, for_all
 from surfkit.raster.native import module
 
-ROUNDS = 2
+ADJUSTMENT_ROUNDS = 2
 """How often vertices are looked for in the views."""
-STEPS = 3
+MOVES_PER_ROUND = 3
 """How often they are moved each time."""
-TURNED = 0.3
+MIN_NORMAL_COSINE = 0.3
 """Cosine between the normals of a face before and after, below which its corners stay where they were."""
-FILTERS = 3
+NORMAL_FILTER_PASSES = 3
 """How often normals are averaged in each round."""
-APART = 0.35
+NORMAL_SIGMA = 0.35
 """Difference of two unit normals at which one counts little for the mean of the other: about 20 degrees."""
 
 
-def adjusted(sights: Sights, mesh: Mesh, reach: float, near: float, smooth: float) -> Mesh:
+def adjusted(sights: ViewObservations, mesh: Mesh, reach: float, near: float, smooth: float) -> Mesh:
     """The same surface, nearer to what the views see, with how many confirm each vertex and how far they lie apart.
 
     Each vertex is drawn along its normal to the planes that the pixels show which it falls on (mean with Tukey's
@@ -42,16 +42,16 @@ def adjusted(sights: Sights, mesh: Mesh, reach: float, near: float, smooth: floa
         normal, local units; NaN where there are none.
     """
     places, faces = mesh.vertices.astype(np.float64), mesh.faces
-    for _ in range(ROUNDS):
-        seen = Pulled.of(sights, places, vertex_normals(places, faces), reach, near)
+    for _ in range(ADJUSTMENT_ROUNDS):
+        seen = VertexTargets.of(sights, places, vertex_normals(places, faces), reach, near)
         before = face_normals(places, faces)[0]
         level = filtered(before, faces)
         share = (seen.weights / (seen.weights + smooth))[:, None]
         moved = places
-        for _ in range(STEPS):
+        for _ in range(MOVES_PER_ROUND):
             moved = moved + share * (seen.wanted - moved) + (1 - share) * to_planes(moved, faces, level)
         places = without_folds(places, moved, faces, before)
-    seen = Pulled.of(sights, places, vertex_normals(places, faces), reach, near)
+    seen = VertexTargets.of(sights, places, vertex_normals(places, faces), reach, near)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(np.where(seen.weights > 0, seen.squares / seen.weights, np.nan))
     values = {"views": seen.views, "error": error.astype(np.float32)}
@@ -59,7 +59,7 @@ def adjusted(sights: Sights, mesh: Mesh, reach: float, near: float, smooth: floa
 
 
 @dataclass(frozen=True)
-class Pulled:
+class VertexTargets:
     """Where the views have the vertices of a surface.
 
     Attributes:
@@ -75,7 +75,9 @@ class Pulled:
     views: np.ndarray
 
     @staticmethod
-    def of(sights: Sights, places: np.ndarray, normals: np.ndarray, reach: float, near: float) -> Pulled:
+    def of(
+        sights: ViewObservations, places: np.ndarray, normals: np.ndarray, reach: float, near: float
+    ) -> VertexTargets:
         """Look at (V, 3) places, whose unit normals are (V, 3), in all views; the lengths are those of `adjusted`."""
         sums, weights, squares, views = np.zeros((4, len(places)), np.float32)
         at = places.astype(np.float32)
@@ -83,7 +85,7 @@ class Pulled:
         job = at, boxes_of(at), normals.astype(np.float32), reach, near, sums, weights, squares, views
         for_all(sights, "adjusting", lambda sight: native.pull(*job, *sight.native, threads))
         wanted = places + normals * (sums / np.maximum(weights, 1e-6))[:, None]
-        return Pulled(wanted, weights, squares, views)
+        return VertexTargets(wanted, weights, squares, views)
 
 
 def without_folds(places: np.ndarray, moved: np.ndarray, faces: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -96,7 +98,7 @@ def without_folds(places: np.ndarray, moved: np.ndarray, faces: np.ndarray, befo
         before: (F, 3) unit normals at the places before.
     """
     moved = moved.copy()
-    while len(turned := faces[(face_normals(moved, faces)[0] * before).sum(1) < TURNED]):
+    while len(turned := faces[(face_normals(moved, faces)[0] * before).sum(1) < MIN_NORMAL_COSINE]):
         if (moved[turned] == places[turned]).all():
             break
         moved[turned] = places[turned]
@@ -136,9 +138,9 @@ def filtered(normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3) unit normals, averaged over faces that share an edge and lie at little of an angle."""
     a, b = beside(faces)
     found = normals
-    for _ in range(FILTERS):
+    for _ in range(NORMAL_FILTER_PASSES):
         apart = ((found[a] - found[b]) ** 2).sum(1)
-        weight = np.exp(-apart / (2 * APART**2))[:, None]
+        weight = np.exp(-apart / (2 * NORMAL_SIGMA**2))[:, None]
         total = found.copy()
         for axis in range(3):
             total[:, axis] += np.bincount(a, weight[:, 0] * found[b, axis], len(found))

@@ -18,14 +18,14 @@ from surfkit.raster.api import Maps
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
-CONFIDENT = 0.375
+MIN_CONTRADICTING_CONFIDENCE = 0.375
 """Confidence of a prior from which it may contradict."""
-APART = 3.0
+CONTRADICTION_TOLERANCES = 3.0
 """Tolerances between a depth and a confident prior from which they contradict each other."""
 
 
 @dataclass(frozen=True)
-class Agreement(Trust):
+class GeometricConsistency(Trust):
     """Weigh pixels by how many other views see a surface in the same place, and leave out those that no view confirms.
 
     After Merrell et al. (2007): a depth is carried into other views, and what these see there is carried back.
@@ -97,7 +97,11 @@ class Agreement(Trust):
             known = (prior.inverse > 0) & (prior.confidence > 0)
             raised = 1 + (self.confirmed - 1) * prior.confidence
             trust = torch.where(known & (off < self.tolerance), trust * raised, trust)
-            wrong = known & (prior.confidence >= CONFIDENT) & (off > APART * self.tolerance)
+            wrong = (
+                known
+                & (prior.confidence >= MIN_CONTRADICTING_CONFIDENCE)
+                & (off > CONTRADICTION_TOLERANCES * self.tolerance)
+            )
             trust = torch.where(wrong, 0.0, trust)
         return trust
 

@@ -18,7 +18,7 @@ from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.scene.scene import Frame, View
 
-MOST_LEVELS = 50
+MAX_NESTING = 50
 """Lists and dicts within one another that facts may have."""
 VALUES = {
     "views": "photographs that confirm the surface there",
@@ -137,7 +137,7 @@ class Mesher(Component):
         """
 
 
-def require_plain(value: Any, at: str, levels: int = MOST_LEVELS) -> None:
+def require_plain(value: Any, at: str, levels: int = MAX_NESTING) -> None:
     """BadInput unless a value can be written to JSON: None, a bool, number or text, or lists and dicts of plain values.
 
     Args:
@@ -156,7 +156,7 @@ def require_plain(value: Any, at: str, levels: int = MOST_LEVELS) -> None:
             "give None, a bool, a number, text, or lists and dicts of these"
         )
     if not levels:
-        raise BadInput(f"{at}: lists and dicts are nested more than {MOST_LEVELS} levels deep")
+        raise BadInput(f"{at}: lists and dicts are nested more than {MAX_NESTING} levels deep")
     for key, item in value.items() if isinstance(value, dict) else enumerate(value):
         if isinstance(value, dict) and not isinstance(key, str):
             raise BadInput(f"{at} has the key {key!r} ({type(key).__name__}), which is not text")

@@ -15,7 +15,7 @@ from surfkit.scene.same_places import first_in_place
 
 
 @dataclass(frozen=True)
-class Report:
+class CleaningReport:
     """What cleaning did, and what is left.
 
     Attributes:
@@ -53,7 +53,7 @@ Inside = Callable[[np.ndarray], np.ndarray]
 
 def clean(
     mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_edges: int = 0, gap: float = 0.0
-) -> tuple[Mesh, Report]:
+) -> tuple[Mesh, CleaningReport]:
     """The mesh without what is no surface, and what was left out.
 
     Args:
@@ -85,7 +85,7 @@ def clean(
     mesh, clustered = _keep(mesh, large[labels])
     mesh, closed = close_holes(_referenced(mesh), hole_edges)
     dropped = (not_finite, degenerate, cropped, len(sizes), int(large.sum()), clustered)
-    return mesh, Report(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh), closed)
+    return mesh, CleaningReport(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh), closed)
 
 
 def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:

@@ -16,16 +16,16 @@ from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.holes import areas_of, edges, fill, rings
 from surfkit.mesh.manifold import apart, separated
-from surfkit.mesh.shade import OPEN
+from surfkit.mesh.shade import OPEN_GROUND_SHARE
 from surfkit.mesh.simplify import collapsed, require_kernels
 
-MOST_EDGES = 64
+MAX_FILLED_EDGES = 64
 """Edges of holes that are filled with the least area; from larger ones, ears are cut until they have as few."""
-MARGIN = 0.02
+BASE_MARGIN_SHARE = 0.02
 """By how much the base lies below the lowest point, as a share of the width of the mesh."""
-SCRAP = 0.01
+MIN_PART_SHARE = 0.01
 """Share of the area of the largest part below which an open part is left out."""
-FLAT = 1e-6
+BASE_COLLAPSE_COST = 1e-6
 """What simplifying the flat base may cost: it is flat, so this is for rounding only; see `collapsed`."""
 
 
@@ -79,7 +79,7 @@ def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
     if rims:
         heights = mesh.vertices.astype(np.float64) @ up
         across = mesh.vertices.astype(np.float64) - heights[:, None] * up
-        base = float(heights.min() - MARGIN * np.ptp(across, axis=0).max())
+        base = float(heights.min() - BASE_MARGIN_SHARE * np.ptp(across, axis=0).max())
         mesh = _on_base(mesh, rims, up, base)
     mesh, empty, volume = _enclosing(mesh)
     dropped = scraps[0] + empty[0], scraps[1] + empty[1]
@@ -122,7 +122,7 @@ def _without_scraps(mesh: Mesh) -> tuple[Mesh, tuple[int, int]]:
     """
     parts = _part_of_vertices(mesh)
     areas = np.bincount(parts[mesh.faces[:, 0]], areas_of(mesh.vertices, mesh.faces), parts.max() + 1)
-    scraps = areas < SCRAP * areas.max()
+    scraps = areas < MIN_PART_SHARE * areas.max()
     is_open = np.zeros(len(areas), bool)
     is_open[parts[edges(mesh)[1][:, 0]]] = True
     scraps &= is_open
@@ -141,7 +141,7 @@ def _rims(mesh: Mesh, loops: list[np.ndarray], up: np.ndarray) -> set[int]:
     parts = _part_of_vertices(mesh)
     a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
     areas, of_face = np.cross(b - a, c - a), parts[mesh.faces[:, 0]]
-    grounds = np.bincount(of_face, areas @ up) > OPEN * np.bincount(of_face, np.linalg.norm(areas, axis=1))
+    grounds = np.bincount(of_face, areas @ up) > OPEN_GROUND_SHARE * np.bincount(of_face, np.linalg.norm(areas, axis=1))
     longest: dict[int, tuple[float, int]] = {}
     for at, loop in enumerate(loops):
         places, own = mesh.vertices[loop].astype(np.float64), int(parts[loop[0]])
@@ -160,7 +160,7 @@ def _filled(mesh: Mesh, loops: list[np.ndarray], known: np.ndarray) -> Mesh:
         made.append(ears)
         by_length.setdefault(len(rest), []).append(rest)
     for length, alike in by_length.items():
-        if length > MOST_EDGES:
+        if length > MAX_FILLED_EDGES:
             fans += alike
             continue
         step = max(1, 1_000_000 // length**2)
@@ -179,9 +179,9 @@ def _filled(mesh: Mesh, loops: list[np.ndarray], known: np.ndarray) -> Mesh:
 def _without_ears(vertices: np.ndarray, loop: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(T, 3) triangles on two edges of a loop each, the shortest third side first, and the loop that is left.
 
-    That has `MOST_EDGES`, or more where all third sides are edges of the mesh already.
+    That has `MAX_FILLED_EDGES`, or more where all third sides are edges of the mesh already.
     """
-    if len(loop) <= MOST_EDGES:
+    if len(loop) <= MAX_FILLED_EDGES:
         return np.empty((0, 3), np.int64), loop
     places, count = vertices[loop].astype(np.float64), len(loop)
     before, after = [*range(-1, count - 1)], [*range(1, count), 0]
@@ -193,7 +193,7 @@ def _without_ears(vertices: np.ndarray, loop: np.ndarray, known: np.ndarray) -> 
 
     heap, ears, gone, left = [ear(at) for at in range(count)], [], np.zeros(count, bool), count
     heapify(heap)
-    while heap and left > MOST_EDGES:
+    while heap and left > MAX_FILLED_EDGES:
         _, at, a, c = heappop(heap)
         if gone[at] or (before[at], after[at]) != (a, c):
             continue
@@ -271,7 +271,7 @@ def _on_base(mesh: Mesh, rims: list[np.ndarray], up: np.ndarray, base: float) ->
         fixed[at_rim] = True
         flat = part.vertices + (base - part.vertices.astype(np.float64) @ up)[:, None] * up
         copy = replace(part, vertices=flat.astype(np.float32), faces=np.ascontiguousarray(part.faces[:, ::-1]))
-        places, bottom, into = collapsed(copy, 1, FLAT, fixed, flat=True)
+        places, bottom, into = collapsed(copy, 1, BASE_COLLAPSE_COST, fixed, flat=True)
         shade = None
         if part.colors is not None:
             shade = np.zeros((len(places), 3))

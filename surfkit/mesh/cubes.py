@@ -29,7 +29,7 @@ def _start(edge: int) -> tuple[int, int, int]:
     return place[0], place[1], place[2]
 
 
-EDGES = np.array([[*_start(edge), edge // 4] for edge in range(12)], np.int32)
+CUBE_EDGES = np.array([[*_start(edge), edge // 4] for edge in range(12)], np.int32)
 """(12, 4) x, y, z of the corner where each edge starts, and its axis."""
 
 

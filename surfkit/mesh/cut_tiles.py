@@ -14,13 +14,13 @@ import numpy as np
 
 from surfkit.raster.native import module
 
-UNKNOWN = -1
+UNDECIDED = -1
 LAST = np.iinfo(np.int32).max
 """The tile of the corners of the tetrahedron around all: after each other."""
 
 
 @dataclass(frozen=True)
-class Tile:
+class TetraTile:
     """Some of many points.
 
     Attributes:
@@ -40,7 +40,7 @@ class Tile:
     title: str
 
 
-def tiles(places: np.ndarray, most: int, halo: float) -> list[Tile]:
+def tiles(places: np.ndarray, most: int, halo: float) -> list[TetraTile]:
     """Boxes that together are all of space, with at most `most` points each, the halo included.
 
     Boxes that are hardly wider than their halo are not divided: they may have more.
@@ -74,29 +74,29 @@ def tiles(places: np.ndarray, most: int, halo: float) -> list[Tile]:
         tile_of[own], last[around] = number, number
     step = max(module().least_step(np.ascontiguousarray(places[around], np.float64)) for _, around in found)
 
-    def tile(number: int, rows: np.ndarray) -> Tile:
+    def tile(number: int, rows: np.ndarray) -> TetraTile:
         title = f", tile {number + 1} of {len(found)}" if len(found) > 1 else ""
         later = np.append(last[rows] > number, [False] * 4)
-        return Tile(number, rows, later, np.append(tile_of[rows], np.full(4, LAST, np.int32)), step, title)
+        return TetraTile(number, rows, later, np.append(tile_of[rows], np.full(4, LAST, np.int32)), step, title)
 
     return [tile(number, around) for number, (_, around) in enumerate(found)]
 
 
 @dataclass
-class Decided:
+class DecidedTetrahedra:
     """Which tetrahedra tiles have decided to be full, for those whose halo they lie in."""
 
     names: np.ndarray = field(default_factory=lambda: np.empty(0, np.uint64))
     full: np.ndarray = field(default_factory=lambda: np.empty(0, bool))
 
-    def of(self, tile: Tile, corners: np.ndarray) -> np.ndarray:
-        """(T,) int8: 1 for full, 0 for empty, `UNKNOWN` if no tile before has decided on a tetrahedron.
+    def of(self, tile: TetraTile, corners: np.ndarray) -> np.ndarray:
+        """(T,) int8: 1 for full, 0 for empty, `UNDECIDED` if no tile before has decided on a tetrahedron.
 
         Args:
             tile: That has the tetrahedra.
             corners: (T, 4) rows of the tile's points.
         """
-        found = np.full(len(corners), UNKNOWN, np.int8)
+        found = np.full(len(corners), UNDECIDED, np.int8)
         if not len(self.names):
             return found
         of = tile.tile_of[corners]
@@ -107,7 +107,7 @@ class Decided:
         found[earlier[there]] = self.full[at[there]]
         return found
 
-    def add(self, tile: Tile, corners: np.ndarray, full: np.ndarray) -> None:
+    def add(self, tile: TetraTile, corners: np.ndarray, full: np.ndarray) -> None:
         """Keep what a tile has decided on the tetrahedra that it shares with later ones.
 
         Args:

@@ -9,16 +9,16 @@ import numpy as np
 from surfkit.core.events import Progress, emit
 from surfkit.raster.native import module
 
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+TETRA_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Vertices of the edges of a tetrahedron."""
 
 BYTES_A_POINT = 4_000
 """What Qhull takes, measured at a million points."""
 
-FEWEST = 2_000
+MIN_TILE_POINTS = 2_000
 """Points in a tile, whatever the budget."""
 
-WIDER = 3
+HALO_DOUBLINGS = 3
 """How often the halo of a tile is doubled before what is left is taken as it is."""
 
 
@@ -37,7 +37,7 @@ def crossing(points: np.ndarray, known: np.ndarray, inside: np.ndarray, budget_b
     Returns:
         (T, 4) int64 rows of `points`, and how many of them are not certain.
     """
-    most = max(FEWEST, int(budget_bytes / BYTES_A_POINT / 2))  # half of it for the halo
+    most = max(MIN_TILE_POINTS, int(budget_bytes / BYTES_A_POINT / 2))  # half of it for the halo
     tiles = [(points.min(0), points.max(0))] if len(points) <= 2 * most else split(points, most)
     found, doubtful = [], 0
     for at, (low, high) in enumerate(tiles, 1):
@@ -79,7 +79,7 @@ def tile(
     if own.sum() < 4 and alone:
         return np.empty((0, 4), np.int64), 0
     halo = 0.25 * float(np.ptp(points[own], axis=0).max()) if own.any() else 0.0
-    for _ in range(WIDER + 1):
+    for _ in range(HALO_DOUBLINGS + 1):
         rows = (
             np.flatnonzero(((points >= low - halo) & (points <= high + halo)).all(1))
             if not alone

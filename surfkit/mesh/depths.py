@@ -7,7 +7,7 @@ import numpy as np
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 
-NEAR = 1e-5
+NEAR_DEPTH_SHARE = 1e-5
 """Depth at which triangles are cut, as a share of the depth of the farthest corner in front of the camera."""
 
 
@@ -29,7 +29,7 @@ def nearest(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarr
     """The same, inf where there is no triangle."""
     pose = camera.world_to_camera.numpy()
     local = vertices @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
-    near = NEAR * max(float(local[:, 2].max(initial=0)), 1e-12)
+    near = NEAR_DEPTH_SHARE * max(float(local[:, 2].max(initial=0)), 1e-12)
     local, faces = in_front(local, faces, near)
     z = np.where(local[:, 2] > 0, local[:, 2], np.nan)
     places = np.stack([local[:, 0] / z * camera.fx + camera.cx, local[:, 1] / z * camera.fy + camera.cy, z], 1)

@@ -13,12 +13,12 @@ from surfkit.mesh.base import MeshInput
 from surfkit.primitives.drawing import PrimitiveRasterizer
 from surfkit.raster.rays import ray_opacity
 
-NEAR_SURFACE = 0.01
+MAX_SEEN_OFFSET = 0.01
 """A vertex is seen where its depth is that of the picture, to this share of it."""
 
 
 @dataclass(frozen=True)
-class Field:
+class ViewOpacityField:
     """Which places lie in the open, by the opacity fields of the views (GOF).
 
     Attributes:
@@ -110,7 +110,7 @@ def vertex_colors(subject: MeshInput, vertices: np.ndarray) -> np.ndarray:
         depth = shown(maps.median, places)
         z = places[:, 2].float()
         # A far pixel says less of a place than a near one.
-        seen = ((depth - z).abs() < NEAR_SURFACE * z) / z.square().clamp_min(1e-12)
+        seen = ((depth - z).abs() < MAX_SEEN_OFFSET * z) / z.square().clamp_min(1e-12)
         total += seen[:, None] * shown(maps.color, places)
         weight += seen[:, None]
         emit(Progress("colouring", index + 1, len(subject.views)))

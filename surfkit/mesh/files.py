@@ -14,14 +14,14 @@ import numpy as np
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.io.glb import FLOAT, INDICES, INT, SHORT, VERTICES, Blocks, linear_colors, write_glb
+from surfkit.io.glb import FLOAT, INDICES, UNSIGNED_INT, UNSIGNED_SHORT, VERTICES, GlbWriter, linear_colors, write_glb
 from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.scene.scene import Frame
 
 Format = Literal["ply", "obj", "glb"]
-CHUNK = 1 << 20
+BATCH_ROWS = 1 << 20
 """Rows that are written at once."""
-UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+GLTF_UP_MATRIX = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
 """By columns, z up to y up, as glTF has it."""
 
 
@@ -46,17 +46,17 @@ def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
     header += [f"element vertex {len(mesh.vertices)}", *(f"property {kinds[kind]} {name}" for name, kind in layout)]
     header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
     file.write("".join(f"{line}\n" for line in header).encode())
-    for at in range(0, len(mesh.vertices), CHUNK):
-        rows = np.empty(len(mesh.vertices[at : at + CHUNK]), layout)
-        rows["x"], rows["y"], rows["z"] = frame.to_file(mesh.vertices[at : at + CHUNK]).T
+    for at in range(0, len(mesh.vertices), BATCH_ROWS):
+        rows = np.empty(len(mesh.vertices[at : at + BATCH_ROWS]), layout)
+        rows["x"], rows["y"], rows["z"] = frame.to_file(mesh.vertices[at : at + BATCH_ROWS]).T
         if mesh.colors is not None:
-            rows["red"], rows["green"], rows["blue"] = mesh.colors[at : at + CHUNK].T
+            rows["red"], rows["green"], rows["blue"] = mesh.colors[at : at + BATCH_ROWS].T
         for name, each in values.items():
-            rows[name] = each[at : at + CHUNK]
+            rows[name] = each[at : at + BATCH_ROWS]
         file.write(rows.tobytes())
-    for at in range(0, len(mesh.faces), CHUNK):
-        rows = np.empty(len(mesh.faces[at : at + CHUNK]), [("count", "u1"), ("at", "<i4", 3)])
-        rows["count"], rows["at"] = 3, mesh.faces[at : at + CHUNK]
+    for at in range(0, len(mesh.faces), BATCH_ROWS):
+        rows = np.empty(len(mesh.faces[at : at + BATCH_ROWS]), [("count", "u1"), ("at", "<i4", 3)])
+        rows["count"], rows["at"] = 3, mesh.faces[at : at + BATCH_ROWS]
         file.write(rows.tobytes())
 
 
@@ -65,15 +65,15 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
     file.write("".join(f"# {note}\n" for note in notes(frame)).encode())
     decimals = max(0, 6 - int(np.floor(np.log10(1 / frame.scale))))
     place = " ".join([f"%.{decimals}f"] * 3)
-    for at in range(0, len(mesh.vertices), CHUNK):
-        rows = frame.to_file(mesh.vertices[at : at + CHUNK])
+    for at in range(0, len(mesh.vertices), BATCH_ROWS):
+        rows = frame.to_file(mesh.vertices[at : at + BATCH_ROWS])
         line = f"v {place}\n"
         if mesh.colors is not None:
-            rows = np.concatenate([rows, mesh.colors[at : at + CHUNK] / 255], axis=1)
+            rows = np.concatenate([rows, mesh.colors[at : at + BATCH_ROWS] / 255], axis=1)
             line = f"v {place} %.4f %.4f %.4f\n"
         file.write("".join([line % tuple(row) for row in rows.tolist()]).encode())
-    for at in range(0, len(mesh.faces), CHUNK):
-        rows = (mesh.faces[at : at + CHUNK] + 1).tolist()
+    for at in range(0, len(mesh.faces), BATCH_ROWS):
+        rows = (mesh.faces[at : at + BATCH_ROWS] + 1).tolist()
         file.write("".join([f"f {a} {b} {c}\n" for a, b, c in rows]).encode())
 
 
@@ -85,15 +85,20 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     Raises:
         BadInput: More than 4 GiB.
     """
-    places, faces, count, blocks = frame.to_file(mesh.vertices).astype("<f4"), mesh.faces, len(mesh.vertices), Blocks()
+    places, faces, count, blocks = (
+        frame.to_file(mesh.vertices).astype("<f4"),
+        mesh.faces,
+        len(mesh.vertices),
+        GlbWriter(),
+    )
     view = blocks.add(places.nbytes, places.tobytes, target=VERTICES, byteStride=12)
     ends = {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
     attributes = {"POSITION": blocks.accessor(view, count=count, componentType=FLOAT, type="VEC3", **ends)}
     view = blocks.add(4 * faces.size, lambda: faces.astype("<u4").tobytes(), target=INDICES)
-    indices = blocks.accessor(view, count=faces.size, componentType=INT, type="SCALAR")
+    indices = blocks.accessor(view, count=faces.size, componentType=UNSIGNED_INT, type="SCALAR")
     if (colors := mesh.colors) is not None:
         view = blocks.add(8 * count, lambda: linear_colors(colors).tobytes(), target=VERTICES, byteStride=8)
-        about = {"componentType": SHORT, "normalized": True, "type": "VEC4"}
+        about = {"componentType": UNSIGNED_SHORT, "normalized": True, "type": "VEC4"}
         attributes["COLOR_0"] = blocks.accessor(view, count=count, **about)
     for name, each in in_files(mesh, frame).items():
         view = blocks.add(4 * count, each.tobytes, target=VERTICES, byteStride=4)
@@ -102,7 +107,7 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
         "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | ({"matrix": UP} if frame.crs else {})],
+        "nodes": [{"mesh": 0} | ({"matrix": GLTF_UP_MATRIX} if frame.crs else {})],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
     }

@@ -10,13 +10,13 @@ import torch
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clusters
-from surfkit.mesh.lattice import Picture
+from surfkit.mesh.lattice import FusionImage
 
-SAMPLES = 32
+TRIANGLES_PER_PART = 32
 """Triangles of a connected part whose middles are looked for in the views."""
 
 
-def drop_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: float) -> tuple[Mesh, int]:
+def drop_floaters(mesh: Mesh, pictures: Iterator[FusionImage], reach: float, ratio: float) -> tuple[Mesh, int]:
     """The mesh without the connected parts that views see through more than they see them, and how many these were.
 
     However small, a part stays that enough views see: thin and small things are no floaters.
@@ -30,7 +30,7 @@ def drop_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: 
     labels, sizes = clusters(mesh)
     order = np.argsort(labels, kind="stable")
     first = np.cumsum(sizes) - sizes
-    taken = np.minimum(sizes, SAMPLES)
+    taken = np.minimum(sizes, TRIANGLES_PER_PART)
     part = np.repeat(np.arange(len(sizes)), taken)
     turn = np.arange(len(part)) - np.repeat(np.cumsum(taken) - taken, taken)
     points = mesh.vertices[mesh.faces[order[first[part] + turn * sizes[part] // taken[part]]]].mean(1, dtype=np.float64)
@@ -43,7 +43,7 @@ def drop_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: 
     return replace(mesh, faces=mesh.faces[stays[labels]]), int((~stays).sum())
 
 
-def _beyond(points: np.ndarray, picture: Picture) -> tuple[np.ndarray, np.ndarray]:
+def _beyond(points: np.ndarray, picture: FusionImage) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the points that fall on pixels which count, and by how much further these see."""
     camera = picture.camera
     x, y, z = camera.project(torch.from_numpy(points)).numpy().T

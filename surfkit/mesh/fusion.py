@@ -15,28 +15,36 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.core.files import MARK, remove
+from surfkit.core.files import FILE_PREFIX, remove
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.floaters import drop_floaters
-from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.lattice import (
+    BLOCK_SIDE_VOXELS,
+    MAX_BLOCKS_FROM_ORIGIN,
+    Corner,
+    FusionImage,
+    Lattice,
+    SurfacePatch,
+    TsdfGrid,
+)
 from surfkit.mesh.native import grid
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import weighed
-from surfkit.mesh.tiles import Box, join
+from surfkit.mesh.tiles import BlockRange, join
 from surfkit.scene.arrays import write_array
 from surfkit.scene.camera import Camera
 
-TILES = f"{MARK}tiles-*"
+TILES_PATTERN = f"{FILE_PREFIX}tiles-*"
 """Pattern of the names of folders with the depth maps of the views."""
-PIXEL_BYTES = 12
+FUSION_PIXEL_BYTES = 12
 """Bytes per pixel of a view on disk."""
 Made = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices, faces, colours."""
 
 
 @dataclass(frozen=True)
-class Task:
+class FusionTask:
     """What is to be fused, and how.
 
     Attributes:
@@ -56,7 +64,7 @@ class Task:
 
     lattice: Lattice
     cameras: tuple[Camera, ...]
-    see: Callable[[int], Picture]
+    see: Callable[[int], FusionImage]
     limit: float
     carve: bool
     least_weight: int
@@ -68,7 +76,7 @@ class Task:
     device: torch.device = torch.device("cpu")
 
 
-def fuse(task: Task, boxes: list[Box]) -> tuple[Made, dict[str, int]]:
+def fuse(task: FusionTask, boxes: list[BlockRange]) -> tuple[Made, dict[str, int]]:
     """Vertices, faces and colours of the surface, and the numbers of tiles and, if they are looked for, of floaters.
 
     Args:
@@ -83,10 +91,10 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[Made, dict[str, int]]:
         return made, {"tiles": tiles, "floaters": floaters}
 
 
-def see_through(task: Task, made: Made) -> tuple[Made, int]:
+def see_through(task: FusionTask, made: Made) -> tuple[Made, int]:
     """The surface without its floaters, and their number."""
 
-    def pictures() -> Iterator[Picture]:
+    def pictures() -> Iterator[FusionImage]:
         for at in range(len(task.cameras)):
             yield task.see(at)
             emit(Progress("looking for floaters", at + 1, len(task.cameras)))
@@ -95,7 +103,7 @@ def see_through(task: Task, made: Made) -> tuple[Made, int]:
     return (mesh.vertices, mesh.faces, made[2]), dropped
 
 
-def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
+def fuse_ready(task: FusionTask, boxes: list[BlockRange]) -> tuple[Made, int]:
     """Vertices, faces and colours, and the number of tiles, of views whose weights are what they will be."""
     if len(boxes) == 1:
         whole = empty(task, task.lattice)
@@ -104,24 +112,24 @@ def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
             return (piece.vertices, piece.faces, piece.colors), 1
         del whole
         emit(Warned("the grid became larger than expected: starting again in tiles"))
-        boxes = cut(Box(), task)
+        boxes = cut(BlockRange(), task)
     with nullcontext(task) if task.stored else spooled(task) as stored:
         return in_tiles(stored, boxes)
 
 
-def empty(task: Task, lattice: Lattice) -> Grid:
+def empty(task: FusionTask, lattice: Lattice) -> TsdfGrid:
     """A grid where the depth maps are fused."""
     return GpuGrid(lattice, task.device) if task.device.type == "cuda" else grid(lattice)
 
 
-def step(task: Task, into: Grid, at: int) -> bool:
+def step(task: FusionTask, into: TsdfGrid, at: int) -> bool:
     """Fuse one view; False if there would be too many blocks."""
     fits = into.fuse(task.see(at), task.carve)
     emit(Progress(task.label, at + 1, len(task.cameras)))
     return fits
 
 
-def in_tiles(task: Task, boxes: list[Box]) -> tuple[Made, int]:
+def in_tiles(task: FusionTask, boxes: list[BlockRange]) -> tuple[Made, int]:
     """The surface, tile by tile."""
     views = [in_sight(camera, task) for camera in task.cameras]
     left, pieces, made = list(reversed(boxes)), [], 0
@@ -140,7 +148,7 @@ def in_tiles(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     return join(pieces), made
 
 
-def tile(task: Task, box: Box, views: list[Box]) -> Pieces | None:
+def tile(task: FusionTask, box: BlockRange, views: list[BlockRange]) -> SurfacePatch | None:
     """The surface in a box; None if its grid would become too large."""
     around = box.with_border()
     part = empty(task, replace(task.lattice, low=around.low, high=around.high))
@@ -150,15 +158,15 @@ def tile(task: Task, box: Box, views: list[Box]) -> Pieces | None:
     return used(part.surface(task.least_weight, box.high, with_edges=True))
 
 
-def used(piece: Pieces) -> Pieces:
+def used(piece: SurfacePatch) -> SurfacePatch:
     """Without the vertices that no face has: those of the border."""
     there = np.zeros(len(piece.vertices), bool)
     there[piece.faces] = True
     place = (np.cumsum(there) - 1).astype(np.int32)
-    return Pieces(piece.vertices[there], place[piece.faces], piece.colors[there], piece.edges[there])
+    return SurfacePatch(piece.vertices[there], place[piece.faces], piece.colors[there], piece.edges[there])
 
 
-def cut(box: Box, task: Task) -> list[Box]:
+def cut(box: BlockRange, task: FusionTask) -> list[BlockRange]:
     """A box in two."""
     seen = in_sight(task.cameras[0], task)
     for camera in task.cameras[1:]:
@@ -171,35 +179,35 @@ def cut(box: Box, task: Task) -> list[Box]:
     return list(halves)
 
 
-def in_sight(camera: Camera, task: Task) -> Box:
+def in_sight(camera: Camera, task: FusionTask) -> BlockRange:
     """Blocks around all that a camera may see."""
     pose = camera.world_to_camera.numpy()
     x = (np.array([0, camera.width]) - camera.cx) / camera.fx
     y = (np.array([0, camera.height]) - camera.cy) / camera.fy
     rays = np.array([[0, 0, 0], *([a, b, 1] for a in x for b in y)]) * task.limit
-    corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * SIDE)
-    margin = 1 + np.ceil(task.lattice.truncation / task.lattice.least_slant / (task.lattice.voxel * SIDE))
+    corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * BLOCK_SIDE_VOXELS)
+    margin = 1 + np.ceil(task.lattice.truncation / task.lattice.least_slant / (task.lattice.voxel * BLOCK_SIDE_VOXELS))
     low, high = np.floor(corners.min(0)) - margin, np.floor(corners.max(0)) + 1 + margin
-    return Box(_corner(low), _corner(high))
+    return BlockRange(_corner(low), _corner(high))
 
 
 def _corner(at: np.ndarray) -> Corner:
-    x, y, z = (int(v) for v in at.clip(1 - MOST, MOST - 1))
+    x, y, z = (int(v) for v in at.clip(1 - MAX_BLOCKS_FROM_ORIGIN, MAX_BLOCKS_FROM_ORIGIN - 1))
     return x, y, z
 
 
 def forget_spooled(scratch: Path) -> None:
     """Delete from a folder what `spooled` left there in a process that was killed."""
-    for left in scratch.glob(TILES):
+    for left in scratch.glob(TILES_PATTERN):
         remove(left)
 
 
 @contextmanager
-def spooled(task: Task) -> Iterator[Task]:
+def spooled(task: FusionTask) -> Iterator[FusionTask]:
     """The task with what every view sees on disk, so that it is drawn once however often it is looked at, and compared
     with other views if that is wanted."""
-    needed = PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
-    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=TILES.rstrip("*")) as name:
+    needed = FUSION_PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
+    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=TILES_PATTERN.rstrip("*")) as name:
         folder = Path(name)
         if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
             raise BadInput(
@@ -212,16 +220,16 @@ def spooled(task: Task) -> Iterator[Task]:
                 write_array(file, np.stack([seen.depth.view(np.uint32), seen.shade, seen.slants.view(np.uint32)]))
             emit(Progress("drawing views", at + 1, len(task.cameras)))
 
-        def read(at: int) -> Picture:
+        def read(at: int) -> FusionImage:
             depth, shade, slant = np.load(folder / f"{at}.npy")
-            return Picture(depth.view(np.float32), shade, task.cameras[at], slant.view(np.float32))
+            return FusionImage(depth.view(np.float32), shade, task.cameras[at], slant.view(np.float32))
 
         if task.compare is not None:
             compare(task, folder)
         yield replace(task, see=read, compare=None, stored=True)
 
 
-def compare(task: Task, folder: Path) -> None:
+def compare(task: FusionTask, folder: Path) -> None:
     """Multiply the weights of the views on disk; depths stay, so the order of the views does not matter."""
 
     def depth(at: int) -> Tensor:

@@ -10,11 +10,11 @@ import numpy as np
 
 from surfkit.mesh.base import Mesh
 
-RIM = 0.25
+MIN_RIM_SHARE = 0.25
 """Share of the area of a connected part from which what would fill a ring shows that the ring is no hole."""
-EVEN = 0.05
+SIDE_AREA_WEIGHT = 0.05
 """Of the squared sides of a triangle, that counts as its area."""
-AT_ONCE = 1_000_000
+BATCH_CORNER_PAIRS = 1_000_000
 """Pairs of corners of the rings that are filled together."""
 
 
@@ -24,7 +24,7 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
     Args:
         mesh: Welded; triangles counter-clockwise seen from outside.
         most: Edges of a hole; longer rings stay open. So does the rim of a part that is open on one side: what would
-            fill it is more than `RIM` of the part.
+            fill it is more than `MIN_RIM_SHARE` of the part.
     """
     if most < 3:
         return mesh, 0
@@ -37,7 +37,7 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
         local, first = fill(corners), length * np.arange(len(some))[:, None, None]
         faces = some.ravel()[first + local]
         spanned = areas_of(corners.reshape(-1, 3), (first + local).reshape(-1, 3)).reshape(len(some), -1).sum(1)
-        fits = (spanned < RIM * areas[parts[some[:, 0]]]) & ~_across(faces, local, length, known)
+        fits = (spanned < MIN_RIM_SHARE * areas[parts[some[:, 0]]]) & ~_across(faces, local, length, known)
         made.append(faces[fits].reshape(-1, 3))
         count += int(fits.sum())
     if not count:
@@ -87,7 +87,7 @@ def _alike(found: Iterable[np.ndarray], most: int) -> Iterator[np.ndarray]:
         if 3 <= len(ring) <= most:
             by_length[len(ring)].append(ring)
     for length in sorted(by_length):
-        rows, step = np.stack(by_length[length]), max(1, AT_ONCE // length**2)
+        rows, step = np.stack(by_length[length]), max(1, BATCH_CORNER_PAIRS // length**2)
         yield from (rows[first : first + step] for first in range(0, len(rows), step))
 
 
@@ -153,7 +153,7 @@ def fill(rings: np.ndarray) -> np.ndarray:
         between = low[:, None] + np.arange(1, span)  # corners of a triangle over the chord from low to low + span
         a, b, c = rings[:, low][:, :, None], rings[:, between], rings[:, low + span][:, :, None]
         area = np.linalg.norm(np.cross(b - a, c - a), axis=3)
-        area += EVEN * (((b - a) ** 2).sum(3) + ((c - b) ** 2).sum(3) + ((c - a) ** 2).sum(3))
+        area += SIDE_AREA_WEIGHT * (((b - a) ** 2).sum(3) + ((c - b) ** 2).sum(3) + ((c - a) ** 2).sum(3))
         total = area + best[:, low[:, None], between] + best[:, between, (low + span)[:, None]]
         best[:, low, low + span] = total.min(2)
         split[:, low, low + span] = between[low, total.argmin(2)]

@@ -8,17 +8,17 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.mesh.cubes import EDGES, triangles
+from surfkit.mesh.cubes import CUBE_EDGES, triangles
 from surfkit.mesh.fusion import used
-from surfkit.mesh.lattice import Pieces
+from surfkit.mesh.lattice import SurfacePatch
 from surfkit.mesh.reference import name_edges
 from surfkit.mesh.tiles import join
 
-TILE = 48
+TILE_CELLS = 48
 """Cells along a tile."""
-COARSE = 8
+COARSE_STEP_CELLS = 8
 """Cells between the points at which a tile is looked at first, to see whether the surface can be in it."""
-MOST_CELLS = 2**18
+MAX_CELLS_PER_AXIS = 2**18
 """Cells along an axis that edges can be named for."""
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -48,12 +48,12 @@ def isosurface(
     if not (voxel > 0 and (high > low).all() and np.isfinite(high - low).all()):
         raise BadInput(f"the lattice of a mesh has voxels of {voxel:g} in a box from {low} to {high}; it needs a size")
     cells = np.ceil((high - low) / voxel - 1e-9).astype(np.int64).clip(1)
-    if cells.max() >= MOST_CELLS:
+    if cells.max() >= MAX_CELLS_PER_AXIS:
         raise BadInput(f"the lattice of a mesh would have {cells.max():,} cells along an axis; give larger voxels")
     starts = list(_starts(cells))
     pieces = []
     for done, start in enumerate(starts, 1):
-        size = np.minimum(cells - start, TILE)
+        size = np.minimum(cells - start, TILE_CELLS)
         if steepest is None or _may_cross(function, low, voxel, start, size, steepest):
             piece = _tile(_evaluate(function, low, voxel, start, size, 1), low, voxel, start)
             pieces += [piece] if len(piece.faces) else []
@@ -65,9 +65,9 @@ def isosurface(
 
 
 def _starts(cells: np.ndarray) -> Iterator[np.ndarray]:
-    for z in range(0, cells[2], TILE):
-        for y in range(0, cells[1], TILE):
-            for x in range(0, cells[0], TILE):
+    for z in range(0, cells[2], TILE_CELLS):
+        for y in range(0, cells[1], TILE_CELLS):
+            for x in range(0, cells[0], TILE_CELLS):
                 yield np.array([x, y, z])
 
 
@@ -88,12 +88,12 @@ def _may_cross(
     function: Function, low: np.ndarray, voxel: float, start: np.ndarray, size: np.ndarray, steepest: float
 ) -> bool:
     """Whether the function can be 0 in a tile: it is, at no point, more than half a diagonal away from one seen."""
-    values = _evaluate(function, low, voxel, start, size, COARSE)
-    reach = 0.5 * np.sqrt(3) * COARSE * voxel * steepest
+    values = _evaluate(function, low, voxel, start, size, COARSE_STEP_CELLS)
+    reach = 0.5 * np.sqrt(3) * COARSE_STEP_CELLS * voxel * steepest
     return bool(np.abs(values).min() <= reach or (values.min() < 0 < values.max()))
 
 
-def _tile(values: np.ndarray, low: np.ndarray, voxel: float, start: np.ndarray) -> Pieces:
+def _tile(values: np.ndarray, low: np.ndarray, voxel: float, start: np.ndarray) -> SurfacePatch:
     """The surface in the cells between (Z, Y, X) values."""
     inside = values < 0
     parts = []
@@ -107,7 +107,7 @@ def _tile(values: np.ndarray, low: np.ndarray, voxel: float, start: np.ndarray) 
         parts.append((where, name_edges(lattice, axis)))
     vertices, edges = (np.concatenate([part[i] for part in parts]) for i in range(2))
     faces = _faces(inside, start, edges)
-    return used(Pieces(vertices.astype(np.float32), faces, np.zeros((len(vertices), 3), np.uint8), edges))
+    return used(SurfacePatch(vertices.astype(np.float32), faces, np.zeros((len(vertices), 3), np.uint8), edges))
 
 
 def _faces(inside: np.ndarray, start: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -119,7 +119,7 @@ def _faces(inside: np.ndarray, start: np.ndarray, edges: np.ndarray) -> np.ndarr
     z, y, x = np.nonzero((case > 0) & (case < 255))
     listed = triangles()[case[z, y, x]]
     at, place = np.nonzero(listed >= 0)
-    edge = EDGES[listed[at, place]]
+    edge = CUBE_EDGES[listed[at, place]]
     names = name_edges((start + np.stack([x, y, z], 1))[at] + edge[:, :3], edge[:, 3])
     order = np.argsort(edges)
     return order[np.searchsorted(edges[order], names)].astype(np.int32).reshape(-1, 3)

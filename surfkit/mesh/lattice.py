@@ -9,40 +9,40 @@ import numpy as np
 
 from surfkit.scene.camera import Camera
 
-SIDE = 8
+BLOCK_SIDE_VOXELS = 8
 """Voxels along a block."""
-BLOCK_BYTES = 7 * SIDE**3
-FULL = 32
+BLOCK_BYTES = 7 * BLOCK_SIDE_VOXELS**3
+FULL_WEIGHT = 32
 """Weight of a pixel that looks straight at a surface and is no larger than a voxel."""
-REACH = 1.5
+BLOCK_REACH_VOXELS = 1.5
 """Blocks are made where a surface is nearer than this, in voxels, along any axis: cells around it must be whole."""
-LEAST_SLANT = 0.6
+MIN_SLANT = 0.6
 """With a truncation of 4 voxels or more."""
 SLANT_OF_VOXEL = 0.15
 """Least slant for each voxel of a shorter truncation."""
-JUMP = 2.0
+MAX_JUMP_VOXELS = 2.0
 """Neighbouring pixels whose depths differ by more than this, in voxels along the normal, are not of one surface."""
-FADE = 1.0
+FADE_START_VOXELS = 1.0
 """Depth behind a surface, in voxels, from which the weight falls to 0 at the truncation: thin walls have two sides."""
-BITS = 17
-MOST = 2 ** (BITS - 1)
+BLOCK_INDEX_BITS = 17
+MAX_BLOCKS_FROM_ORIGIN = 2 ** (BLOCK_INDEX_BITS - 1)
 """Blocks from the origin along an axis that can be numbered."""
 
 Corner = tuple[int, int, int]
 
 
 def least_slant(voxel: float, truncation: float) -> float:
-    """The least slant of a pixel (see `Picture`): at smaller grazing angles, surfaces count as seen at this one.
+    """The least slant of a pixel (see `FusionImage`): at smaller grazing angles, surfaces count as seen at this one.
 
     What is seen at a grazing angle is often round, and leaves the plane of a pixel. The plane is used as far as the
     truncation reaches, along the ray truncation / slant: with a short truncation at most 1 / `SLANT_OF_VOXEL` voxels,
-    at angles as small as those at which a road is seen; with a longer one further, at angles above `LEAST_SLANT`.
+    at angles as small as those at which a road is seen; with a longer one further, at angles above `MIN_SLANT`.
 
     Args:
         voxel: Local units.
         truncation: Local units.
     """
-    return min(LEAST_SLANT, SLANT_OF_VOXEL * truncation / voxel)
+    return min(MIN_SLANT, SLANT_OF_VOXEL * truncation / voxel)
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ class Lattice:
 
     voxel: float
     truncation: float
-    low: Corner = (1 - MOST,) * 3
-    high: Corner = (MOST - 1,) * 3
+    low: Corner = (1 - MAX_BLOCKS_FROM_ORIGIN,) * 3
+    high: Corner = (MAX_BLOCKS_FROM_ORIGIN - 1,) * 3
     most_blocks: int = 2**31 - 1
 
     def offsets(self, camera: Camera) -> np.ndarray:
         """(3, 512) float32 camera coordinates of the voxels of a block, x fastest, less those of the first."""
-        z, y, x = np.indices((SIDE, SIDE, SIDE)).reshape(3, -1)
+        z, y, x = np.indices((BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS)).reshape(3, -1)
         turn = camera.world_to_camera[:3, :3].numpy()[:, :, None] * self.voxel
         return (turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z).astype(np.float32)
 
@@ -77,16 +77,21 @@ class Lattice:
     @property
     def lengths(self) -> list[float]:
         """Truncation, jump and fade in local units."""
-        return [self.truncation, JUMP * self.voxel, min(FADE * self.voxel, 0.5 * self.truncation)]
+        return [
+            self.truncation,
+            MAX_JUMP_VOXELS * self.voxel,
+            min(FADE_START_VOXELS * self.voxel, 0.5 * self.truncation),
+        ]
 
 
 @dataclass(frozen=True)
-class Picture:
+class FusionImage:
     """What a view sees.
 
     Attributes:
         depth: (H, W) float32 camera z, local units; 0 for none, always finite.
-        shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL`, or more where
+        shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL_WEIGHT`, or more
+        where
             it is trusted more.
         camera: Of the view.
         slant: (H, W) float32 distance from the plane that a pixel shows, for each unit of depth before or behind it:
@@ -105,7 +110,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Pieces:
+class SurfacePatch:
     """A part of a surface.
 
     Attributes:
@@ -121,26 +126,28 @@ class Pieces:
     edges: np.ndarray
 
 
-class Grid(ABC):
+class TsdfGrid(ABC):
     """Distances, weights and colours of the voxels near surfaces."""
 
     blocks: int
     bytes: int
 
     @abstractmethod
-    def fuse(self, picture: Picture, carve: bool) -> bool:
+    def fuse(self, picture: FusionImage, carve: bool) -> bool:
         """Average a view into the voxels near what it sees, or with `carve` into all in sight that there are so far.
 
         False, and nothing is changed, if that took more blocks than the lattice allows.
         """
 
     @abstractmethod
-    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
+    def surface(
+        self, least_weight: int, end: Corner = (MAX_BLOCKS_FROM_ORIGIN,) * 3, with_edges: bool = False
+    ) -> SurfacePatch:
         """Triangles where all eight voxels around have a weight, of cells in blocks below `end`; front faces see them
         counter-clockwise."""
 
 
-class HostGrid(Grid):
+class HostGrid(TsdfGrid):
     """A grid in the memory of the CPU."""
 
     @abstractmethod
@@ -148,7 +155,8 @@ class HostGrid(Grid):
         """Take blocks that another grid has fused, none of which is here.
 
         Args:
-            keys: (B,) int64, the coordinates of each block: from the lowest bit up x, y and z plus `MOST`, `BITS` each.
+            keys: (B,) int64, the coordinates of each block: from the lowest bit up x, y and z plus
+            `MAX_BLOCKS_FROM_ORIGIN`, `BLOCK_INDEX_BITS` each.
             distance: (B, 512) int16, in 1/32767 of the truncation.
             weight: (B, 512) uint16.
             color: (B, 3, 512) uint8.

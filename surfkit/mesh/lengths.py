@@ -15,16 +15,16 @@ from surfkit.raster.api import Splats
 from surfkit.scene.lengths import Length, to_local
 from surfkit.scene.scene import Frame
 
-SAMPLED = 16
+SAMPLED_VIEWS = 16
 """Views that automatic lengths are taken from."""
-DEPTHS = 2.0
+DEPTH_LIMIT_MEDIANS = 2.0
 """Automatic limit of the depth, in median depths, where hardly anything lies beyond."""
-WITHIN = 0.98
+DEPTH_LIMIT_SHARE = 0.98
 """Share of the pixels whose depth is within the automatic limit: photographs along a street show much that is further
 than twice the median."""
-NEAR = 0.03
+MAX_DEPTH_OFFSET = 0.03
 """Share of its depth by which a splat may lie off what a view sees there, and be part of it."""
-LEAST_CUT = 1.75
+MIN_TRUNCATION_VOXELS = 1.75
 """Least truncation, voxels: the corners of a cell lie up to the root of three from a plane through it."""
 
 
@@ -51,7 +51,8 @@ def resolve(
     Args:
         voxel: Side of a voxel; if it is auto, `voxel_px` pixels at the median depth.
         truncation: Of distances; if it is auto, `truncation_voxels` voxels.
-        limit: Depth from which nothing is fused; if it is auto, `DEPTHS` median depths, or that of the share `WITHIN`
+        limit: Depth from which nothing is fused; if it is auto, `DEPTH_LIMIT_MEDIANS` median depths, or that of the
+        share `DEPTH_LIMIT_SHARE`
             of the pixels if it is more.
         subject: What is meshed.
         which: Depth of a pixel.
@@ -65,13 +66,13 @@ def resolve(
     if given[0] is None or given[2] is None:
         depth, pixel, far = look(subject, which)
         given[0] = given[0] or voxel_px * pixel
-        given[2] = given[2] or max(DEPTHS * depth, far)
+        given[2] = given[2] or max(DEPTH_LIMIT_MEDIANS * depth, far)
     size, cut, far = given
     cut = cut or truncation_voxels * size
-    if cut < LEAST_CUT * size:
+    if cut < MIN_TRUNCATION_VOXELS * size:
         raise BadInput(
             f"mesh.truncation is {with_unit(cut, subject.frame)} with voxels of {with_unit(size, subject.frame)}; "
-            f"it must be at least {LEAST_CUT:g} voxels"
+            f"it must be at least {MIN_TRUNCATION_VOXELS:g} voxels"
         )
     return Lengths(size, cut, far)
 
@@ -84,9 +85,9 @@ def with_unit(length: float, frame: Frame) -> str:
 
 
 def sampled(subject: MeshInput) -> list[int]:
-    """Positions of up to `SAMPLED` views, evenly."""
+    """Positions of up to `SAMPLED_VIEWS` views, evenly."""
     count = len(subject.views)
-    return [at * count // min(SAMPLED, count) for at in range(min(SAMPLED, count))]
+    return [at * count // min(SAMPLED_VIEWS, count) for at in range(min(SAMPLED_VIEWS, count))]
 
 
 def shown(subject: MeshInput, at: int, which: Which) -> Tensor:
@@ -97,7 +98,7 @@ def shown(subject: MeshInput, at: int, which: Which) -> Tensor:
 
 def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
     """Median over some views of their median depth, of the width of a pixel there, and of all pixels the depth that a
-    share of `WITHIN` has at most; local units.
+    share of `DEPTH_LIMIT_SHARE` has at most; local units.
 
     Views without depth are passed over for others.
     """
@@ -118,7 +119,7 @@ def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
             f"no depth in any of {count} views: the splats are not opaque enough to be a surface; train for more steps"
             + (", or try --mesh.depth expected" if which == "median" else "")
         )
-    far = np.quantile(torch.cat(seen).numpy(), WITHIN)
+    far = np.quantile(torch.cat(seen).numpy(), DEPTH_LIMIT_SHARE)
     return float(np.median(depths)), float(np.median(pixels)), float(far)
 
 
@@ -135,5 +136,5 @@ def without_hidden(subject: MeshInput, which: Which) -> Splats:
         inside = torch.nonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))[:, 0]
         found = depth[y[inside].long(), x[inside].long()]
         looked[inside] = True
-        seen[inside] |= (found > 0) & ((found / z[inside] - 1).abs() < NEAR)
+        seen[inside] |= (found > 0) & ((found / z[inside] - 1).abs() < MAX_DEPTH_OFFSET)
     return subject.splats.take(seen | ~looked)

@@ -12,11 +12,11 @@ import numpy as np
 
 from surfkit.mesh.base import Mesh
 
-APART = 0.01
+SEPARATION_SHARE = 0.01
 """By how much vertices in one place are moved apart, as a share of the way to their neighbours."""
-FINEST = 2.0**-20
+MERGE_SHARE = 2.0**-20
 """Places that are nearer than this are one, as a share of the extent."""
-ROUNDS = 20
+SEPARATION_ROUNDS = 20
 """Of moving apart."""
 
 
@@ -41,7 +41,7 @@ def separated(mesh: Mesh) -> Mesh:
     fans = connected_components(links, directed=False)[1]
     _, row, at = np.unique(start << 32 | fans, return_index=True, return_inverse=True)  # in the order of the vertices
     mesh = mesh.take(mesh.faces.ravel()[row], at.reshape(-1, 3).astype(np.int32))
-    for _ in range(ROUNDS):
+    for _ in range(SEPARATION_ROUNDS):
         if not (halves := _half_edges(mesh))[3]:
             break
         mesh = _halved(mesh, halves)
@@ -118,8 +118,8 @@ def apart(mesh: Mesh) -> Mesh:
     own neighbours.
     """
     vertices = mesh.vertices.copy()
-    low, step = vertices.min(0), max(float(np.ptp(vertices, axis=0).max()) * FINEST, 1e-30)
-    for turn in range(ROUNDS):
+    low, step = vertices.min(0), max(float(np.ptp(vertices, axis=0).max()) * MERGE_SHARE, 1e-30)
+    for turn in range(SEPARATION_ROUNDS):
         cells = ((vertices - low) / step).astype(np.int64)
         _, first = np.unique(cells[:, 0] << 42 | cells[:, 1] << 21 | cells[:, 2], return_index=True)
         double = np.ones(len(vertices), bool)
@@ -138,6 +138,6 @@ def apart(mesh: Mesh) -> Mesh:
         way[lengths == 0] = [1, 0, 0]
         # where triangles are tiny, farther each time, and not all as far
         least = step * (1 + turn) * (1 + np.flatnonzero(double) % 8)
-        share = np.maximum(APART, least / np.where(lengths > 0, lengths, 1))
+        share = np.maximum(SEPARATION_SHARE, least / np.where(lengths > 0, lengths, 1))
         vertices[double] += (share[:, None] * way).astype(np.float32)
     return replace(mesh, vertices=vertices)

@@ -6,8 +6,16 @@ import numpy as np
 import torch
 
 from surfkit.core.events import Warned, emit
-from surfkit.mesh.cubes import EDGES, triangles
-from surfkit.mesh.lattice import MOST, REACH, Corner, HostGrid, Lattice, Picture, Pieces
+from surfkit.mesh.cubes import CUBE_EDGES, triangles
+from surfkit.mesh.lattice import (
+    BLOCK_REACH_VOXELS,
+    MAX_BLOCKS_FROM_ORIGIN,
+    Corner,
+    FusionImage,
+    HostGrid,
+    Lattice,
+    SurfacePatch,
+)
 from surfkit.mesh.reference import ReferenceGrid
 from surfkit.raster.native import lacking, module
 
@@ -18,7 +26,7 @@ class NativeGrid(HostGrid):
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
         corners = list(lattice.low), list(lattice.high)
-        self.native = module().Grid(lattice.voxel, REACH * lattice.voxel, *corners, lattice.most_blocks)
+        self.native = module().Grid(lattice.voxel, BLOCK_REACH_VOXELS * lattice.voxel, *corners, lattice.most_blocks)
 
     @property
     def blocks(self) -> int:
@@ -28,7 +36,7 @@ class NativeGrid(HostGrid):
     def bytes(self) -> int:
         return self.native.bytes
 
-    def fuse(self, picture: Picture, carve: bool) -> bool:
+    def fuse(self, picture: FusionImage, carve: bool) -> bool:
         camera = picture.camera
         return self.native.fuse(
             np.ascontiguousarray(picture.depth, np.float32),
@@ -46,9 +54,11 @@ class NativeGrid(HostGrid):
     def put(self, keys: np.ndarray, distance: np.ndarray, weight: np.ndarray, color: np.ndarray) -> None:
         self.native.put(keys, distance, weight, color)
 
-    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
-        table = triangles(), EDGES
-        return Pieces(*self.native.surface(*table, least_weight, list(end), with_edges, torch.get_num_threads()))
+    def surface(
+        self, least_weight: int, end: Corner = (MAX_BLOCKS_FROM_ORIGIN,) * 3, with_edges: bool = False
+    ) -> SurfacePatch:
+        table = triangles(), CUBE_EDGES
+        return SurfacePatch(*self.native.surface(*table, least_weight, list(end), with_edges, torch.get_num_threads()))
 
 
 def grid(lattice: Lattice) -> HostGrid:

@@ -13,13 +13,13 @@ from torch import Tensor
 from surfkit.scene.camera import Camera
 from surfkit.scene.parallax import degrees_between, worth
 
-PROBES = 12
+PROBES_PER_SIDE = 12
 """Pixels along each side of a view whose points are projected into other views."""
-WIDEST = 45.0
+MAX_RAY_DEGREES = 45.0
 """Degrees between rays from which on a view is not compared."""
-CANDIDATES = 128
+MAX_NEARBY_VIEWS = 128
 """Number of nearby views that the probes are projected into."""
-LEAST = 0.01
+MIN_GAIN_SHARE = 0.01
 """A view with a weight below this share of the probes is not compared."""
 
 
@@ -67,7 +67,7 @@ def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
     while len(chosen) < min(count, len(near)):
         gains = (worths / (1 + covered)).sum(1)
         best = int(gains.argmax())
-        if gains[best] <= LEAST * len(points):
+        if gains[best] <= MIN_GAIN_SHARE * len(points):
             break
         chosen.append(near[best])
         covered += worths[best]
@@ -77,8 +77,8 @@ def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
 
 def probes(camera: Camera, depth: Tensor) -> np.ndarray:
     """(P, 3) float64 points of the world that pixels spread over a view show."""
-    rows = np.linspace(0, camera.height - 1, min(PROBES, camera.height)).round().astype(int)
-    columns = np.linspace(0, camera.width - 1, min(PROBES, camera.width)).round().astype(int)
+    rows = np.linspace(0, camera.height - 1, min(PROBES_PER_SIDE, camera.height)).round().astype(int)
+    columns = np.linspace(0, camera.width - 1, min(PROBES_PER_SIDE, camera.width)).round().astype(int)
     y, x = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
     z = depth.numpy()[y, x].astype(np.float64)
     x, y, z = x[z > 0], y[z > 0], z[z > 0]
@@ -88,12 +88,13 @@ def probes(camera: Camera, depth: Tensor) -> np.ndarray:
 
 
 def nearby(at: int, depths: Depths, distance: float) -> list[int]:
-    """Other views that stand near enough to see what lies at a distance at less than `WIDEST`, evenly thinned."""
-    eye, reach = depths.centres[at], 2 * np.tan(np.radians(WIDEST / 2)) * distance
+    """Other views that stand near enough to see what lies at a distance at less than `MAX_RAY_DEGREES`, evenly
+    thinned."""
+    eye, reach = depths.centres[at], 2 * np.tan(np.radians(MAX_RAY_DEGREES / 2)) * distance
     around = np.array(depths.places.query_ball_point(eye, reach, return_sorted=True), np.int64)
     apart = np.linalg.norm(depths.centres[around] - eye, axis=1)
     found = [int(i) for i in around[np.argsort(apart, kind="stable")] if i != at]
-    return found[:: -(-len(found) // CANDIDATES)] if found else []
+    return found[:: -(-len(found) // MAX_NEARBY_VIEWS)] if found else []
 
 
 def _worth(points: np.ndarray, eye: np.ndarray, other: Camera, angle: float) -> np.ndarray:
@@ -104,4 +105,4 @@ def _worth(points: np.ndarray, eye: np.ndarray, other: Camera, angle: float) -> 
         u, v = other.fx * x / z + other.cx, other.fy * y / z + other.cy
         inside = (z > 0) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height)
     between = degrees_between(points, eye, other.centre.numpy())
-    return np.where(inside & (between < WIDEST), worth(between, angle), 0)
+    return np.where(inside & (between < MAX_RAY_DEGREES), worth(between, angle), 0)

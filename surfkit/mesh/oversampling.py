@@ -14,7 +14,7 @@ from surfkit.io.datasets.depth_prior import DepthPrior, resized
 from surfkit.mesh.base import MeshInput
 from surfkit.scene.camera import Camera
 
-LONGEST = 4096
+MAX_MAGNIFIED_PX = 4096
 """Side up to which pictures are magnified, pixels: twice the size takes four times the memory."""
 
 
@@ -22,7 +22,7 @@ def oversampled(subject: MeshInput, factor: float) -> MeshInput:
     """What is to be meshed, drawn with `factor` times as many pixels in a row and in a column, without photographs.
 
     Splats have no pixels: more of them follow edges, and surfaces that are seen from the side, more closely. Pictures
-    get no longer than `LONGEST` pixels by it.
+    get no longer than `MAX_MAGNIFIED_PX` pixels by it.
 
     Raises:
         BadInput: What is drawn are no splats.
@@ -34,12 +34,13 @@ def oversampled(subject: MeshInput, factor: float) -> MeshInput:
             "mesh.oversampling draws splats with more pixels, and what is drawn here is not made of splats; give 1"
         )
     views = [replace(view, camera=magnified(view.camera, factor)) for view in subject.views]
-    capped = sum(factor > 1 and factor * max(v.camera.width, v.camera.height) > LONGEST for v in subject.views)
+    capped = sum(factor > 1 and factor * max(v.camera.width, v.camera.height) > MAX_MAGNIFIED_PX for v in subject.views)
     if capped:
         emit(
             Warned(
                 f"mesh.oversampling {factor:g} would make {capped:,} of {len(views):,} depth maps longer than "
-                f"{LONGEST:,} pixels: they are drawn at that size, or at that of the photograph if it is larger"
+                f"{MAX_MAGNIFIED_PX:,} pixels: they are drawn at that size, or at that of the photograph if it is "
+                f"larger"
             )
         )
 
@@ -52,8 +53,9 @@ def oversampled(subject: MeshInput, factor: float) -> MeshInput:
 
 
 def magnified(camera: Camera, factor: float) -> Camera:
-    """The same camera with a picture that is `factor` times as large, or of `LONGEST` pixels if that would be more."""
-    factor = min(factor, max(1.0, LONGEST / max(camera.width, camera.height)))
+    """The same camera with a picture that is `factor` times as large, or of `MAX_MAGNIFIED_PX` pixels if that would be
+    more."""
+    factor = min(factor, max(1.0, MAX_MAGNIFIED_PX / max(camera.width, camera.height)))
     return camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
 
 

@@ -8,26 +8,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.mesh.lattice import FULL, Picture, least_slant
+from surfkit.mesh.lattice import FULL_WEIGHT, FusionImage, least_slant
 from surfkit.raster.api import Maps
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 F = np.float32
 Which = Literal["median", "expected"]
-MOST = 255
+MAX_PIXEL_WEIGHT = 255
 """Largest weight of a pixel that its shade can hold."""
-OPAQUE = 0.5
+MIN_DEPTH_ALPHA = 0.5
 """Least alpha of a pixel whose expected depth counts; the median depth has the same bound of its own."""
 
 
 def depth_of(maps: Maps, which: Which) -> Tensor:
     """(H, W) camera z; 0 where there is none or it is not finite."""
-    depth = maps.median if which == "median" else torch.where(maps.alpha >= OPAQUE, maps.expected_depth(), 0.0)
+    depth = maps.median if which == "median" else torch.where(maps.alpha >= MIN_DEPTH_ALPHA, maps.expected_depth(), 0.0)
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
-def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float, truncation: float) -> Picture:
+def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float, truncation: float) -> FusionImage:
     """What a view sees, with the weight of each pixel.
 
     A pixel counts by the cosine between its ray and the normal, and fully if it is no larger than a voxel at its depth,
@@ -45,11 +45,11 @@ def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float, truncation:
     least = least_slant(voxel, truncation)
     if module() is None:
         made, slant = shade(plain, planes[0], planes[1], camera, near, least)
-        return Picture(plain, made, camera, slant)
+        return FusionImage(plain, made, camera, slant)
     made, slant = np.empty(plain.shape, np.uint32), np.empty(plain.shape, F)
     lens = [camera.fx, camera.fy, camera.cx, camera.cy]
     module().shade(plain, *planes, lens, near, least, made, slant, module().kernels_in_use(), torch.get_num_threads())
-    return Picture(plain, made, camera, slant)
+    return FusionImage(plain, made, camera, slant)
 
 
 def shade(
@@ -72,7 +72,7 @@ def shade(
             length = np.sqrt(squares * (x * x + y * y + F(1)))
             upright = np.fmax(np.fmin(along / np.fmax(length, F(1e-10)), F(1)), F(0))
         weight = size * size * upright
-        whole = np.maximum((weight * F(FULL) + F(0.5)).astype(np.uint32), 1)
+        whole = np.maximum((weight * F(FULL_WEIGHT) + F(0.5)).astype(np.uint32), 1)
         planes = (np.fmin(np.fmax(color, F(0)), F(1)) * F(255) + F(0.5)).astype(np.uint32)
     counted = np.where((weight > 0) & (depth > 0), whole, 0).astype(np.uint32)
     return planes[0] | planes[1] << np.uint32(8) | planes[2] << np.uint32(16) | counted << np.uint32(24), slant
@@ -82,10 +82,11 @@ def weighed(shade: np.ndarray, trust: np.ndarray) -> np.ndarray:
     """(H, W) uint32 shades whose weights are multiplied and rounded; what counts at all goes on doing so.
 
     Args:
-        shade: (H, W) uint32, see `Picture`.
-        trust: (H, W) float32, 0 or more; where it is 0, the pixel no longer counts. No weight becomes more than `MOST`.
+        shade: (H, W) uint32, see `FusionImage`.
+        trust: (H, W) float32, 0 or more; where it is 0, the pixel no longer counts. No weight becomes more than
+        `MAX_PIXEL_WEIGHT`.
     """
     weight = (shade >> 24).astype(F)
-    whole = np.clip((weight * trust.astype(F) + F(0.5)).astype(np.uint32), 1, MOST)
+    whole = np.clip((weight * trust.astype(F) + F(0.5)).astype(np.uint32), 1, MAX_PIXEL_WEIGHT)
     counted = np.where((weight > 0) & (trust > 0), whole, 0).astype(np.uint32)
     return shade & np.uint32(0xFFFFFF) | counted << np.uint32(24)

@@ -15,7 +15,7 @@ from surfkit.core.events import Progress, emit
 from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 
-ENOUGH = 100
+MIN_ORIENTED_POINTS = 100
 """Fewest oriented points that make a surface."""
 
 
@@ -47,8 +47,8 @@ class Poisson(Mesher):
     def __post_init__(self) -> None:
         if not 3 <= self.octree <= 16:
             raise BadInput(f"mesh: poisson.octree is {self.octree}; it must be 3 to 16")
-        if self.points < ENOUGH or not 0 <= self.thin < 1:
-            allowed = f"give {ENOUGH} or more, and 0 or more below 1"
+        if self.points < MIN_ORIENTED_POINTS or not 0 <= self.thin < 1:
+            allowed = f"give {MIN_ORIENTED_POINTS} or more, and 0 or more below 1"
             raise BadInput(f"mesh: poisson.points is {self.points} and thin {self.thin}; {allowed}")
 
     def ready(self) -> None:
@@ -60,7 +60,7 @@ class Poisson(Mesher):
         share = -(-self.points // len(subject.views))
         found = [seen_pixels(subject, at, share, self.depth) for at in range(len(subject.views))]
         points, normals, colors = (torch.cat([getattr(p, n) for p in found]) for n in ("points", "normals", "colors"))
-        if len(points) < ENOUGH:
+        if len(points) < MIN_ORIENTED_POINTS:
             raise BadInput(f"mesh: only {len(points)} pixels of {len(subject.views)} views have a depth; train longer")
         return reconstructed(points, normals, colors, self.octree, self.thin, "mesh:poisson")
 

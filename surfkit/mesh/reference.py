@@ -7,10 +7,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.mesh.cubes import EDGES, triangles
-from surfkit.mesh.lattice import BITS, BLOCK_BYTES, MOST, REACH, SIDE, Corner, HostGrid, Lattice, Picture, Pieces
+from surfkit.mesh.cubes import CUBE_EDGES, triangles
+from surfkit.mesh.lattice import (
+    BLOCK_BYTES,
+    BLOCK_INDEX_BITS,
+    BLOCK_REACH_VOXELS,
+    BLOCK_SIDE_VOXELS,
+    MAX_BLOCKS_FROM_ORIGIN,
+    Corner,
+    FusionImage,
+    HostGrid,
+    Lattice,
+    SurfacePatch,
+)
 
-BATCH = 256
+BATCH_BLOCKS = 256
 """Blocks that are fused at once."""
 F = np.float32
 
@@ -21,9 +32,9 @@ class ReferenceGrid(HostGrid):
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
         self.keys = np.empty(0, np.int64)  # sorted
-        self.distance = np.empty((0, SIDE**3), np.int16)
-        self.weight = np.empty((0, SIDE**3), np.uint16)
-        self.color = np.empty((0, 3, SIDE**3), np.uint8)
+        self.distance = np.empty((0, BLOCK_SIDE_VOXELS**3), np.int16)
+        self.weight = np.empty((0, BLOCK_SIDE_VOXELS**3), np.uint16)
+        self.color = np.empty((0, 3, BLOCK_SIDE_VOXELS**3), np.uint8)
 
     @property
     def blocks(self) -> int:
@@ -33,7 +44,7 @@ class ReferenceGrid(HostGrid):
     def bytes(self) -> int:
         return self.blocks * BLOCK_BYTES
 
-    def fuse(self, picture: Picture, carve: bool) -> bool:
+    def fuse(self, picture: FusionImage, carve: bool) -> bool:
         touched = self._seen_by(picture)
         fresh = np.setdiff1d(touched, self.keys)
         if self.blocks + len(fresh) > self.lattice.most_blocks:
@@ -41,8 +52,8 @@ class ReferenceGrid(HostGrid):
         self._insert(fresh)
         rows = np.arange(self.blocks) if carve else np.searchsorted(self.keys, touched)
         offsets = self.lattice.offsets(picture.camera)
-        for at in range(0, len(rows), BATCH):
-            self._fuse_rows(rows[at : at + BATCH], picture, offsets)
+        for at in range(0, len(rows), BATCH_BLOCKS):
+            self._fuse_rows(rows[at : at + BATCH_BLOCKS], picture, offsets)
         return True
 
     def put(self, keys: np.ndarray, distance: np.ndarray, weight: np.ndarray, color: np.ndarray) -> None:
@@ -58,7 +69,7 @@ class ReferenceGrid(HostGrid):
             old = getattr(self, name)
             setattr(self, name, np.concatenate([old, np.zeros((len(fresh), *old.shape[1:]), old.dtype)])[order])
 
-    def _seen_by(self, picture: Picture) -> np.ndarray:
+    def _seen_by(self, picture: FusionImage) -> np.ndarray:
         """Sorted keys of the blocks within reach of what the pixels show."""
         camera = picture.camera
         rows, columns = np.nonzero((picture.depth > 0) & (picture.shade >> 24 > 0))
@@ -66,9 +77,9 @@ class ReferenceGrid(HostGrid):
         ray = [(columns + 0.5 - F(camera.cx)) / F(camera.fx), (rows + 0.5 - F(camera.cy)) / F(camera.fy)]
         local = np.stack([ray[0] * d, ray[1] * d, d])
         pose = camera.world_to_camera.numpy()
-        side = self.lattice.voxel * SIDE
+        side = self.lattice.voxel * BLOCK_SIDE_VOXELS
         at = (pose[:3, :3].T @ (local - pose[:3, 3:])).T / side
-        reach = REACH / SIDE
+        reach = BLOCK_REACH_VOXELS / BLOCK_SIDE_VOXELS
         low = np.maximum(np.floor(at - reach).astype(np.int64), self.lattice.low)
         high = np.minimum(np.floor(at + reach).astype(np.int64), np.array(self.lattice.high) - 1)
         corners = np.unique(np.concatenate([low, high], 1)[(low <= high).all(1)], axis=0)
@@ -76,11 +87,11 @@ class ReferenceGrid(HostGrid):
         every = np.minimum(corners[:, None, :3] + steps, corners[:, None, 3:])
         return np.unique(pack(every.reshape(-1, 3)))
 
-    def _fuse_rows(self, rows: np.ndarray, picture: Picture, offsets: np.ndarray) -> None:
+    def _fuse_rows(self, rows: np.ndarray, picture: FusionImage, offsets: np.ndarray) -> None:
         camera, (truncation, jump, fade) = picture.camera, map(F, self.lattice.lengths)
         height, width = picture.depth.shape
         pose = camera.world_to_camera.numpy()
-        start = unpack(self.keys[rows]) * (self.lattice.voxel * SIDE)
+        start = unpack(self.keys[rows]) * (self.lattice.voxel * BLOCK_SIDE_VOXELS)
         first = [r[0] * start[:, 0] + r[1] * start[:, 1] + r[2] * start[:, 2] + r[3] for r in pose[:3]]
         x0, y0, z0 = (row.astype(F)[:, None] for row in first)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -109,7 +120,7 @@ class ReferenceGrid(HostGrid):
         seeds = scramble_key(self.keys[rows]).astype(np.uint32)[:, None]
         noise = scramble(
             seeds
-            + np.arange(SIDE**3, dtype=np.uint32) * np.uint32(0x9E3779B9)
+            + np.arange(BLOCK_SIDE_VOXELS**3, dtype=np.uint32) * np.uint32(0x9E3779B9)
             + before.astype(np.uint32) * np.uint32(0x85EBCA6B)
         )
         self.weight[rows] = np.where(changed, np.minimum(total, F(65535)), before).astype(np.uint16)
@@ -127,14 +138,16 @@ class ReferenceGrid(HostGrid):
             whole = np.clip(mean.astype(np.int32), 0, 255)
             self.color[rows, channel] = np.where(changed, whole, self.color[rows, channel])
 
-    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
+    def surface(
+        self, least_weight: int, end: Corner = (MAX_BLOCKS_FROM_ORIGIN,) * 3, with_edges: bool = False
+    ) -> SurfacePatch:
         values, colors = self._corners(least_weight)  # (B, 9, 9, 9): z, y, x
-        here = values[:, :SIDE, :SIDE, :SIDE]
-        block, base = np.arange(self.blocks), unpack(self.keys) * SIDE
+        here = values[:, :BLOCK_SIDE_VOXELS, :BLOCK_SIDE_VOXELS, :BLOCK_SIDE_VOXELS]
+        block, base = np.arange(self.blocks), unpack(self.keys) * BLOCK_SIDE_VOXELS
         parts = []
         for axis in range(3):
             step = np.eye(3, dtype=int)[axis][::-1]
-            to = tuple(slice(s, SIDE + s) for s in step)
+            to = tuple(slice(s, BLOCK_SIDE_VOXELS + s) for s in step)
             other = values[(slice(None), *to)]
             rows, z, y, x = np.nonzero(here * other < 0)
             a, b = here[rows, z, y, x].astype(np.float64), other[rows, z, y, x].astype(np.float64)
@@ -148,19 +161,24 @@ class ReferenceGrid(HostGrid):
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")  # by block, axis, voxel
         vertices, shades, edges = (np.concatenate([part[i] for part in parts])[order] for i in (1, 2, 3))
         faces = self._faces(values, (unpack(self.keys) < np.array(end)).all(1)[block], edges)
-        return Pieces(vertices.astype(F), faces, shades, edges if with_edges else edges[:0])
+        return SurfacePatch(vertices.astype(F), faces, shades, edges if with_edges else edges[:0])
 
     def _corners(self, least_weight: int) -> tuple[np.ndarray, np.ndarray]:
         """Distances and colours of each block and of the next voxel on each axis; distance 0 where nothing is known."""
         known = self.weight >= least_weight
         plain = np.where(known, np.where(self.distance == 0, 1, self.distance), 0).astype(np.int32)
-        plain, shades = plain.reshape(-1, SIDE, SIDE, SIDE), self.color.reshape(-1, 3, SIDE, SIDE, SIDE)
-        values = np.zeros((self.blocks, SIDE + 1, SIDE + 1, SIDE + 1), np.int32)
-        colors = np.zeros((self.blocks, 3, SIDE + 1, SIDE + 1, SIDE + 1), np.uint8)
+        plain, shades = (
+            plain.reshape(-1, BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS),
+            self.color.reshape(-1, 3, BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS, BLOCK_SIDE_VOXELS),
+        )
+        values = np.zeros((self.blocks, BLOCK_SIDE_VOXELS + 1, BLOCK_SIDE_VOXELS + 1, BLOCK_SIDE_VOXELS + 1), np.int32)
+        colors = np.zeros(
+            (self.blocks, 3, BLOCK_SIDE_VOXELS + 1, BLOCK_SIDE_VOXELS + 1, BLOCK_SIDE_VOXELS + 1), np.uint8
+        )
         for n in range(8):
             dx, dy, dz = n & 1, n >> 1 & 1, n >> 2
             rows, found = self._find(self.keys + pack_step(dx, dy, dz))
-            to = tuple(slice(SIDE, None) if d else slice(0, SIDE) for d in (dz, dy, dx))
+            to = tuple(slice(BLOCK_SIDE_VOXELS, None) if d else slice(0, BLOCK_SIDE_VOXELS) for d in (dz, dy, dx))
             source = tuple(slice(0, 1) if d else slice(None) for d in (dz, dy, dx))
             values[(found, *to)] = plain[(rows, *source)]
             colors[(found, slice(None), *to)] = shades[(rows, slice(None), *source)]
@@ -174,15 +192,16 @@ class ReferenceGrid(HostGrid):
 
     def _faces(self, values: np.ndarray, wanted: np.ndarray, edges: np.ndarray) -> np.ndarray:
         corners = [
-            values[:, dz : SIDE + dz, dy : SIDE + dy, dx : SIDE + dx] for dz, dy, dx in np.ndindex(2, 2, 2)
+            values[:, dz : BLOCK_SIDE_VOXELS + dz, dy : BLOCK_SIDE_VOXELS + dy, dx : BLOCK_SIDE_VOXELS + dx]
+            for dz, dy, dx in np.ndindex(2, 2, 2)
         ]  # in the order of their numbers
         whole = np.logical_and.reduce([c != 0 for c in corners]) & wanted[:, None, None, None]
         case = sum((c < 0).astype(np.int32) << at for at, c in enumerate(corners))
         rows, z, y, x = np.nonzero(whole & (case > 0) & (case < 255))
         listed = triangles()[case[rows, z, y, x]]
-        cell = unpack(self.keys)[rows] * SIDE + np.stack([x, y, z], 1)
+        cell = unpack(self.keys)[rows] * BLOCK_SIDE_VOXELS + np.stack([x, y, z], 1)
         at, place = np.nonzero(listed >= 0)
-        edge = EDGES[listed[at, place]]
+        edge = CUBE_EDGES[listed[at, place]]
         names = name_edges(cell[at] + edge[:, :3], edge[:, 3])
         order = np.argsort(edges)
         return order[np.searchsorted(edges[order], names)].astype(np.int32).reshape(-1, 3)
@@ -190,23 +209,26 @@ class ReferenceGrid(HostGrid):
 
 def pack(blocks: np.ndarray) -> np.ndarray:
     """(B,) int64 keys of (B, 3) coordinates of blocks."""
-    x, y, z = (blocks + MOST).T
-    return z << 2 * BITS | y << BITS | x
+    x, y, z = (blocks + MAX_BLOCKS_FROM_ORIGIN).T
+    return z << 2 * BLOCK_INDEX_BITS | y << BLOCK_INDEX_BITS | x
 
 
 def pack_step(dx: int, dy: int, dz: int) -> int:
     """What to add to a key to get that of a neighbour."""
-    return dx + (dy << BITS) + (dz << 2 * BITS)
+    return dx + (dy << BLOCK_INDEX_BITS) + (dz << 2 * BLOCK_INDEX_BITS)
 
 
 def unpack(keys: np.ndarray) -> np.ndarray:
     """(B, 3) coordinates of blocks."""
-    return np.stack([keys >> axis * BITS & (2**BITS - 1) for axis in range(3)], 1) - MOST
+    return (
+        np.stack([keys >> axis * BLOCK_INDEX_BITS & (2**BLOCK_INDEX_BITS - 1) for axis in range(3)], 1)
+        - MAX_BLOCKS_FROM_ORIGIN
+    )
 
 
 def name_edges(voxels: np.ndarray, axis: np.ndarray | int) -> np.ndarray:
     """(E,) int64 of the edges of the lattice that go up an axis from (E, 3) voxels."""
-    x, y, z = (voxels.astype(np.int64) + MOST * SIDE).T
+    x, y, z = (voxels.astype(np.int64) + MAX_BLOCKS_FROM_ORIGIN * BLOCK_SIDE_VOXELS).T
     return np.asarray(axis, np.int64) << 60 | z << 40 | y << 20 | x
 
 

@@ -17,11 +17,11 @@ from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
 BACKGROUND = 1.0
-LIGHT = np.array([-0.4, -0.5, -0.77])
+LIGHT_DIRECTION = np.array([-0.4, -0.5, -0.77])
 """Towards the light, in the camera's frame: from above the left shoulder."""
-SAMPLES = 500_000
+SAMPLED_ELEMENTS = 500_000
 """Triangles and vertices, about, that tell how a mesh lies and how far it reaches; of larger ones, every n-th."""
-OPEN = 0.1
+OPEN_GROUND_SHARE = 0.1
 """Share of the area of a mesh that faces one way, on the whole, from which it is open ground."""
 
 
@@ -114,7 +114,7 @@ def from_above(mesh: Mesh, up: np.ndarray, longest: int, colors: np.ndarray | No
     across /= np.linalg.norm(across)
     turn = np.stack([-across, np.cross(-up, -across), -up])  # x to the right, y down, z away from the eye
     local = mesh.vertices.astype(np.float64) @ turn.T
-    low, high = np.percentile(local[:: 1 + len(local) // SAMPLES, :2], [0.5, 99.5], axis=0)
+    low, high = np.percentile(local[:: 1 + len(local) // SAMPLED_ELEMENTS, :2], [0.5, 99.5], axis=0)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)
     scale = longest / max((high - low).max(), 1e-12)
     width, height = (max(1, round(float(side))) for side in (high - low) * scale)
@@ -132,7 +132,7 @@ def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int], colo
     a, b, c = (local[mesh.faces[face[there], i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)
-    light = normals @ (LIGHT / np.linalg.norm(LIGHT))
+    light = normals @ (LIGHT_DIRECTION / np.linalg.norm(LIGHT_DIRECTION))
     # What is seen from behind is blue: the mesh is open or turned inside out there.
     behind = (normals * (a + b + c)).sum(1) > 0
     grey = 0.25 + 0.7 * np.abs(light)
@@ -146,11 +146,11 @@ def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int], colo
 
 def up_of(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
     """(3,) the direction that is up: where open ground faces on the whole; for closed bodies, that of photographs."""
-    some = mesh.faces[:: 1 + len(mesh.faces) // SAMPLES]
+    some = mesh.faces[:: 1 + len(mesh.faces) // SAMPLED_ELEMENTS]
     a, b, c = (mesh.vertices[some[:, i]].astype(np.float64) for i in range(3))
     areas = np.cross(b - a, c - a)
     whole, sizes = areas.sum(0), np.linalg.norm(areas, axis=1).sum()
-    if np.linalg.norm(whole) > OPEN * sizes:
+    if np.linalg.norm(whole) > OPEN_GROUND_SHARE * sizes:
         return whole / np.linalg.norm(whole)
     poses = np.stack([camera.world_to_camera.numpy() for camera in cameras])
     heads = -poses[:, 1, :3].mean(0)

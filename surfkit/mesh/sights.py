@@ -16,19 +16,19 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.mesh.base import MeshInput
-from surfkit.mesh.fusion import TILES
+from surfkit.mesh.fusion import TILES_PATTERN
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import Which, depth_of
 from surfkit.mesh.trust import Trust
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
-PIXEL_BYTES = 18
+SIGHT_PIXEL_BYTES = 18
 """Bytes per pixel of a view on disk."""
 
 
 @dataclass(frozen=True)
-class Sight:
+class ViewObservation:
     """What a view sees.
 
     Attributes:
@@ -53,7 +53,7 @@ class Sight:
         return self.depth, self.weight, self.normal, self.color, lens, camera.world_to_camera.flatten().tolist()
 
 
-class Sights(Sequence[Sight]):
+class ViewObservations(Sequence[ViewObservation]):
     """The sights of all views, in a folder."""
 
     def __init__(self, folder: Path, cameras: Sequence[Camera]) -> None:
@@ -62,9 +62,9 @@ class Sights(Sequence[Sight]):
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def __getitem__(self, at: int) -> Sight:  # type: ignore[override]
-        depth, weight, normal, color = (np.load(self.folder / f"{at}-{name}.npy") for name in NAMES)
-        return Sight(self.cameras[at], depth, weight.astype(np.float32), normal.astype(np.float32), color)
+    def __getitem__(self, at: int) -> ViewObservation:  # type: ignore[override]
+        depth, weight, normal, color = (np.load(self.folder / f"{at}-{name}.npy") for name in SIGHT_MAPS)
+        return ViewObservation(self.cameras[at], depth, weight.astype(np.float32), normal.astype(np.float32), color)
 
     def depths(self) -> Depths:
         """The first depth map of each view."""
@@ -75,16 +75,16 @@ class Sights(Sequence[Sight]):
         return Depths(self.cameras, read)
 
     def write(self, at: int, **arrays: np.ndarray) -> None:
-        """Write some of the arrays of a view, by their names in `Sight`."""
+        """Write some of the arrays of a view, by their names in `ViewObservation`."""
         for name, values in arrays.items():
             np.save(self.folder / f"{at}-{name}.npy", values)
 
 
-NAMES = "depth", "weight", "normal", "color"
+SIGHT_MAPS = "depth", "weight", "normal", "color"
 
 
 @dataclass(frozen=True)
-class Seeing:
+class ObservationSettings:
     """How views look at splats.
 
     Attributes:
@@ -105,22 +105,22 @@ class Seeing:
 
 
 @contextmanager
-def seen(subject: MeshInput, how: Seeing) -> Iterator[Sights]:
+def seen(subject: MeshInput, how: ObservationSettings) -> Iterator[ViewObservations]:
     """What all views see, each drawn once, and compared with the others.
 
     Raises:
         BadInput: The disk has no room for it.
     """
     views = subject.views
-    needed = PIXEL_BYTES * sum(view.camera.width * view.camera.height for view in views)
-    with tempfile.TemporaryDirectory(dir=subject.scratch, prefix=TILES.rstrip("*")) as name:
+    needed = SIGHT_PIXEL_BYTES * sum(view.camera.width * view.camera.height for view in views)
+    with tempfile.TemporaryDirectory(dir=subject.scratch, prefix=TILES_PATTERN.rstrip("*")) as name:
         folder = Path(name)
         if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
             raise BadInput(
                 f"{folder.parent}: {needed / 1e9:.1f} GB of disk are needed for the depth of all views and "
                 f"{free / 1e9:.1f} GB are free; make room"
             )
-        sights = Sights(folder, [view.camera for view in views])
+        sights = ViewObservations(folder, [view.camera for view in views])
         for at in range(len(views)):
             sights.write(at, **_drawn(subject, at, how))
             emit(Progress("drawing views", at + 1, len(views)))
@@ -134,7 +134,7 @@ def seen(subject: MeshInput, how: Seeing) -> Iterator[Sights]:
         yield sights
 
 
-def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
+def _drawn(subject: MeshInput, at: int, how: ObservationSettings) -> dict[str, np.ndarray]:
     view = subject.views[at]
     maps, keep = subject.draw(view), subject.keep(at)
     depth = depth_of(maps, how.which)
@@ -160,10 +160,10 @@ def _drawn(subject: MeshInput, at: int, how: Seeing) -> dict[str, np.ndarray]:
     }
 
 
-Each = Callable[[Sight], None]
+Each = Callable[[ViewObservation], None]
 
 
-def for_all(sights: Sights, what: str, each: Each, places: np.ndarray | None = None) -> None:
+def for_all(sights: ViewObservations, what: str, each: Each, places: np.ndarray | None = None) -> None:
     """Call `each` with every sight, or those that may see some of (N, 3) places, and report progress."""
     looking = range(len(sights))
     if places is not None:

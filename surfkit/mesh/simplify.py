@@ -12,7 +12,7 @@ from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
 from surfkit.raster.native import lacking, module
 
-SPARE = 6.0
+COLLAPSE_COST_FACTOR = 6.0
 """What a collapse may cost, in squares of the length that is allowed: then 99 of 100 places stay within it."""
 
 
@@ -42,7 +42,7 @@ def simplified(mesh: Mesh, most: int | None = None, error: float | None = None) 
     require_kernels("simplifying a mesh")
     if not len(mesh.faces) or (error is None and (most is None or most >= len(mesh.faces))):
         return mesh
-    vertices, faces, into = collapsed(mesh, most or 1, np.inf if error is None else SPARE * error**2)
+    vertices, faces, into = collapsed(mesh, most or 1, np.inf if error is None else COLLAPSE_COST_FACTOR * error**2)
     values = {name: _means(each, into, len(vertices)).astype(np.float32) for name, each in mesh.values.items()}
     colors = mesh.colors
     if colors is not None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.depth_prior import KNOWN
+from surfkit.io.datasets.depth_prior import MIN_KNOWN_CONFIDENCE
 from surfkit.mesh.base import MeshInput
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
@@ -38,7 +38,7 @@ def without_sky(subject: MeshInput) -> MeshInput:
         mask, prior = subject.keep(at), priors[at]
         if prior is None:
             return mask
-        solid = ~sky(subject.views[at].camera, prior.confidence >= KNOWN, up)
+        solid = ~sky(subject.views[at].camera, prior.confidence >= MIN_KNOWN_CONFIDENCE, up)
         return solid if mask is None else mask & solid
 
     return replace(subject, keep=keep)

@@ -15,7 +15,7 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.scene.scene import Frame, View
 
-POINTS = 2_000_000
+SAMPLED_MAP_POINTS = 2_000_000
 """About as many points of the maps tell where the surface lies, and so how much memory it takes."""
 
 
@@ -87,7 +87,7 @@ def seen(view: View, prior: DepthPrior | None, photo: Tensor | None, least: floa
 
 def points(views: Sequence[View], draw: Callable[[View], Maps]) -> Splats:
     """Points of the maps, evenly from all views, as splats that tell where the surface is."""
-    found = [_points(view, draw(view).median, max(1, POINTS // len(views))) for view in views]
+    found = [_points(view, draw(view).median, max(1, SAMPLED_MAP_POINTS // len(views))) for view in views]
     means = torch.cat(found) if found else torch.empty(0, 3)
     count = len(means)
     one = torch.ones(count, 4)

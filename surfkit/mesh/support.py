@@ -6,12 +6,12 @@ import numpy as np
 import torch
 
 from surfkit.mesh.adjust import beside
-from surfkit.mesh.sights import Sights, boxes_of, for_all
+from surfkit.mesh.sights import ViewObservations, boxes_of, for_all
 from surfkit.raster.native import module
 
 
 def supported(
-    sights: Sights, points: np.ndarray, faces: np.ndarray, side: float, least_views: int, guesses: float
+    sights: ViewObservations, points: np.ndarray, faces: np.ndarray, side: float, least_views: int, guesses: float
 ) -> np.ndarray:
     """(F,) bool: faces whose middle enough views confirm, and those in gaps between them.
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.delaunay import EDGES, crossing
-from surfkit.mesh.field import Field, vertex_colors
+from surfkit.mesh.delaunay import TETRA_EDGES, crossing
+from surfkit.mesh.field import ViewOpacityField, vertex_colors
 from surfkit.scene.rotations import rotations
 
 TRIANGLES = (
@@ -27,7 +27,7 @@ TRIANGLES = (
 )  # fmt: skip
 """Edges of a positively oriented tetrahedron whose points make its triangles, by the bits of the vertices inside."""
 
-FINEST = 52
+MAX_BISECTIONS = 52
 """Halvings after which float64 has no more digits."""
 
 
@@ -66,18 +66,18 @@ class Tetra(Mesher):
             raise BadInput(f"mesh: tetra.reach is {self.reach} and thickness {self.thickness}; both must be positive")
         if not (0 < self.level < 1 and 0 <= self.agree < 1):
             raise BadInput(f"mesh: tetra.level is {self.level} and agree {self.agree}; both must lie between 0 and 1")
-        if not 0 <= self.bisections <= FINEST or self.min_views < 1 or self.longest < 0:
+        if not 0 <= self.bisections <= MAX_BISECTIONS or self.min_views < 1 or self.longest < 0:
             raise BadInput(
                 f"mesh: tetra.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
-                f"give 0 to {FINEST}, 1 or more, 0 or more"
+                f"give 0 to {MAX_BISECTIONS}, 1 or more, 0 or more"
             )
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
         points, rows, half = pivots(subject, self.faint, self.reach, self.thickness)
-        field = Field(subject, self.level, self.agree)
+        field = ViewOpacityField(subject, self.level, self.agree)
         hidden, views = field.hidden(points, "looking at points")
-        edges = Edges(points, half.norm(dim=1)[rows], (views >= self.min_views).numpy(), hidden.numpy())
+        edges = SurfaceBracket(points, half.norm(dim=1)[rows], (views >= self.min_views).numpy(), hidden.numpy())
         return edges.surface(subject, self.bisections, self.longest, lambda at, what: field.hidden(at, what)[0])
 
 
@@ -116,7 +116,7 @@ def pivots(subject: MeshInput, faint: float, reach: float, thickness: float) -> 
 
 
 @dataclass(frozen=True)
-class Edges:
+class SurfaceBracket:
     """Points on both sides of a surface.
 
     Attributes:
@@ -191,7 +191,7 @@ def triangles(tets: np.ndarray, inside: np.ndarray, points: np.ndarray) -> tuple
     found = []
     for bits, table in enumerate(TRIANGLES):
         rows = tets[case == bits]
-        ends = rows[:, np.array(EDGES)[list(table)]] if table else np.empty((0, 3, 2), np.int64)
+        ends = rows[:, np.array(TETRA_EDGES)[list(table)]] if table else np.empty((0, 3, 2), np.int64)
         found.append(ends.reshape(-1, 3, 2))
     ends = np.concatenate(found).reshape(-1, 2)
     ends = np.where(inside[ends[:, :1]], ends, ends[:, ::-1])

@@ -8,51 +8,51 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.mesh.lattice import BLOCK_BYTES, MOST, SIDE, Corner, Pieces
+from surfkit.mesh.lattice import BLOCK_BYTES, BLOCK_SIDE_VOXELS, MAX_BLOCKS_FROM_ORIGIN, Corner, SurfacePatch
 from surfkit.raster.api import Splats
 
 GRID_BYTES = 1.05 * BLOCK_BYTES
 """Of a block, its place in the table included."""
 MESH_BYTES = 5_000
 """Most that the triangles of a block take while tiles are joined: everything twice, and the names of the vertices."""
-SHARE = 0.2
+GRID_BUDGET_SHARE = 0.2
 """Of the memory budget that a grid may take; the rest is for the triangles, which are all there at the end."""
-DENSE = 4
+MIN_CELL_SPLATS = 4
 """Splats in a cell from which it is taken for covered."""
-THICK = 3.0
+BLOCKS_PER_SURFACE_BLOCK = 3.0
 """Blocks for each that a surface passes through."""
-BLOCK_TRIANGLES = 2 * SIDE**2 / THICK
+BLOCK_TRIANGLES = 2 * BLOCK_SIDE_VOXELS**2 / BLOCKS_PER_SURFACE_BLOCK
 """Of a block that is counted, where the surface is flat; and half as many vertices."""
 
 
 @dataclass(frozen=True)
-class Box:
+class BlockRange:
     """Blocks from `low` up to, without, `high`."""
 
-    low: Corner = (1 - MOST,) * 3
-    high: Corner = (MOST - 1,) * 3
+    low: Corner = (1 - MAX_BLOCKS_FROM_ORIGIN,) * 3
+    high: Corner = (MAX_BLOCKS_FROM_ORIGIN - 1,) * 3
 
-    def halves(self, seen: Box) -> tuple[Box, Box] | None:
+    def halves(self, seen: BlockRange) -> tuple[BlockRange, BlockRange] | None:
         """Cut through the longest side of what has been seen in it; None if it is a single block."""
         low, high = np.maximum(self.low, seen.low), np.minimum(self.high, seen.high)
         axis = int((high - low).argmax())
         if high[axis] - low[axis] < 2:
             return None
         cut = int(low[axis] + high[axis]) // 2
-        return Box(self.low, _put(self.high, axis, cut)), Box(_put(self.low, axis, cut), self.high)
+        return BlockRange(self.low, _put(self.high, axis, cut)), BlockRange(_put(self.low, axis, cut), self.high)
 
-    def with_border(self) -> Box:
+    def with_border(self) -> BlockRange:
         """One more block at the upper ends: cells there have corners in it."""
-        return Box(self.low, tuple(min(side + 1, MOST - 1) for side in self.high))
+        return BlockRange(self.low, tuple(min(side + 1, MAX_BLOCKS_FROM_ORIGIN - 1) for side in self.high))
 
-    def meets(self, other: Box) -> bool:
+    def meets(self, other: BlockRange) -> bool:
         """Whether they have a block in common."""
         return bool((np.maximum(self.low, other.low) < np.minimum(self.high, other.high)).all())
 
-    def joined(self, other: Box) -> Box:
+    def joined(self, other: BlockRange) -> BlockRange:
         """The smallest box around both."""
         low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
-        return Box(tuple(low.tolist()), tuple(high.tolist()))
+        return BlockRange(tuple(low.tolist()), tuple(high.tolist()))
 
 
 def _put(corner: Corner, axis: int, value: int) -> Corner:
@@ -61,7 +61,7 @@ def _put(corner: Corner, axis: int, value: int) -> Corner:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class GridEstimate:
     """Blocks that a surface will take.
 
     Attributes:
@@ -80,7 +80,7 @@ class Estimate:
         return int(len(self.cells) * self.blocks)
 
 
-def estimate(splats: Splats, voxel: float, within: tuple[np.ndarray, np.ndarray]) -> Estimate:
+def estimate(splats: Splats, voxel: float, within: tuple[np.ndarray, np.ndarray]) -> GridEstimate:
     """Count blocks from where the splats lie; cells grow until several splats share one, and stand for a surface.
 
     Args:
@@ -92,10 +92,10 @@ def estimate(splats: Splats, voxel: float, within: tuple[np.ndarray, np.ndarray]
     means = means[((means >= within[0]) & (means <= within[1])).all(1)]
     for level in range(BITS_OF_CELL + 1):
         along = 2**level
-        cells = different(np.floor(means / (voxel * SIDE * along)).astype(np.int64))
-        if len(means) >= DENSE * len(cells):
+        cells = different(np.floor(means / (voxel * BLOCK_SIDE_VOXELS * along)).astype(np.int64))
+        if len(means) >= MIN_CELL_SPLATS * len(cells):
             break
-    return Estimate(cells, along, THICK * along**2)
+    return GridEstimate(cells, along, BLOCKS_PER_SURFACE_BLOCK * along**2)
 
 
 def different(cells: np.ndarray) -> np.ndarray:
@@ -113,23 +113,26 @@ def different(cells: np.ndarray) -> np.ndarray:
 BITS_OF_CELL = 12
 
 
-def plan(found: Estimate, most_blocks: int) -> list[Box]:
+def plan(found: GridEstimate, most_blocks: int) -> list[BlockRange]:
     """Boxes that together are all of space, none of which is expected to need more than `most_blocks`."""
 
-    def cut(box: Box, cells: np.ndarray) -> list[Box]:
+    def cut(box: BlockRange, cells: np.ndarray) -> list[BlockRange]:
         if len(cells) * found.blocks <= most_blocks or not len(cells) or not np.ptp(cells, axis=0).any():
             return [box]
         axis = int(np.ptp(cells, axis=0).argmax())
         low, high = cells[:, axis].min(), cells[:, axis].max()
         at = int(np.clip(np.median(cells[:, axis]), low + 1, high))
         left, border = cells[:, axis] < at, at * found.blocks_along
-        lower, upper = Box(box.low, _put(box.high, axis, border)), Box(_put(box.low, axis, border), box.high)
+        lower, upper = (
+            BlockRange(box.low, _put(box.high, axis, border)),
+            BlockRange(_put(box.low, axis, border), box.high),
+        )
         return [*cut(lower, cells[left]), *cut(upper, cells[~left])]
 
-    return cut(Box(), found.cells)
+    return cut(BlockRange(), found.cells)
 
 
-def join(pieces: Sequence[Pieces]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def join(pieces: Sequence[SurfacePatch]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, faces and colours of all; vertices of the same edge of the lattice, which are the same, become one."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     names = np.concatenate([piece.edges for piece in pieces])

@@ -14,20 +14,20 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.cuda import grid as gpu
-from surfkit.mesh.fusion import Task, fuse
-from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import LEAST_CUT, Lengths, resolve, with_unit, without_hidden
+from surfkit.mesh.fusion import FusionTask, fuse
+from surfkit.mesh.lattice import BLOCK_SIDE_VOXELS, FULL_WEIGHT, MAX_BLOCKS_FROM_ORIGIN, FusionImage, Lattice
+from surfkit.mesh.lengths import MIN_TRUNCATION_VOXELS, Lengths, resolve, with_unit, without_hidden
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.sky import may_show_sky, without_sky
-from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
+from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BUDGET_SHARE, GRID_BYTES, MESH_BYTES, GridEstimate, estimate, plan
 from surfkit.mesh.trust import Trust
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import up_of_views
 
-LEAST_BYTES = 50_000_000
+MIN_MEMORY_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
 AUTO_TRIANGLES = 20_000_000
 """About as many as an automatic voxel gives at most."""
@@ -98,9 +98,10 @@ class TSDF(Mesher):
             check_length(f"mesh.{name}", getattr(self, name))
         if not 0.1 <= self.voxel_px <= 100:
             raise BadInput(f"mesh.voxel_px is {self.voxel_px:g}; it must be from 0.1 to 100")
-        if not LEAST_CUT <= self.truncation_voxels <= 100:
+        if not MIN_TRUNCATION_VOXELS <= self.truncation_voxels <= 100:
             raise BadInput(
-                f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from {LEAST_CUT:g} to 100"
+                f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from {MIN_TRUNCATION_VOXELS:g} to "
+                f"100"
             )
         if not 0.1 <= self.oversampling <= 8:
             raise BadInput(f"mesh.oversampling is {self.oversampling:g}; it must be from 0.1 to 8")
@@ -133,10 +134,10 @@ class TSDF(Mesher):
         """See `Mesher.mesh`."""
         if not len(subject.splats) or not subject.views:
             raise BadInput("nothing to mesh: there are no splats or no views")
-        if subject.budget_bytes < LEAST_BYTES:
+        if subject.budget_bytes < MIN_MEMORY_BYTES:
             raise BadInput(
                 f"{subject.budget_bytes / 1e6:.0f} MB are too little to mesh in; give --memory "
-                f"{LEAST_BYTES // 10**6}MB or more"
+                f"{MIN_MEMORY_BYTES // 10**6}MB or more"
             )
         given = len(subject.splats)
         if not self.sky:
@@ -146,17 +147,17 @@ class TSDF(Mesher):
         lengths, found = self._lengths(subject)
         subject = oversampled(subject, self.oversampling)
         device = subject.rasterizer.where()
-        most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
+        most_blocks = max(int(GRID_BUDGET_SHARE * subject.budget_bytes / GRID_BYTES), 64)
         if device.type == "cuda":
             most_blocks = min(most_blocks, gpu.most_blocks(device))
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)
-        least = max(1, round(FULL * self.least_views))
+        least = max(1, round(FULL_WEIGHT * self.least_views))
         label = f"fusing views, {describe_lengths(lengths, subject)}"
         compare = None if self.trust is None else self.trust.among
         see = self._eyes(subject, lengths)
         how = lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
-        task = Task(lattice, cameras, see, *how, device=device)
+        task = FusionTask(lattice, cameras, see, *how, device=device)
         (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
         left_out = {"oversized_splats": given - len(subject.splats)} if self.largest_px else {}
         if not len(faces):
@@ -166,10 +167,10 @@ class TSDF(Mesher):
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | counts | left_out)
 
-    def _eyes(self, subject: MeshInput, lengths: Lengths) -> Callable[[int], Picture]:
+    def _eyes(self, subject: MeshInput, lengths: Lengths) -> Callable[[int], FusionImage]:
         """What gives what the view at a position sees."""
 
-        def see(at: int) -> Picture:
+        def see(at: int) -> FusionImage:
             view = subject.views[at]
             maps = subject.draw(view)
             depth = depth_of(maps, self.depth)
@@ -185,7 +186,7 @@ class TSDF(Mesher):
 
         return see
 
-    def _lengths(self, subject: MeshInput) -> tuple[Lengths, Estimate]:
+    def _lengths(self, subject: MeshInput) -> tuple[Lengths, GridEstimate]:
         """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
         given = self.voxel, self.truncation, self.depth_limit
         lengths = resolve(*given, subject, self.depth, self.voxel_px, self.truncation_voxels)
@@ -206,7 +207,7 @@ class TSDF(Mesher):
         while self.voxel == "auto" and found.total > most:
             coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
             auto = self.truncation == "auto"
-            cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, LEAST_CUT * coarser)
+            cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, MIN_TRUNCATION_VOXELS * coarser)
             lengths = Lengths(coarser, cut, lengths.limit)
             found = estimate(splats, coarser, within)
         refuse_too_fine(lengths, subject, np.abs(within).max())
@@ -230,9 +231,9 @@ def facts(lengths: Lengths, subject: MeshInput) -> dict[str, Any]:
 
 def refuse_too_fine(lengths: Lengths, subject: MeshInput, farthest: float) -> None:
     """BadInput if the voxels cannot be numbered."""
-    blocks = farthest / (lengths.voxel * SIDE)
-    if blocks > MOST - 2:
-        least = farthest / ((MOST - 2) * SIDE)
+    blocks = farthest / (lengths.voxel * BLOCK_SIDE_VOXELS)
+    if blocks > MAX_BLOCKS_FROM_ORIGIN - 2:
+        least = farthest / ((MAX_BLOCKS_FROM_ORIGIN - 2) * BLOCK_SIDE_VOXELS)
         raise BadInput(
             f"mesh.voxel is {with_unit(lengths.voxel, subject.frame)}, too small for a scene of "
             f"{with_unit(2 * farthest, subject.frame)}; give {with_unit(1.01 * least, subject.frame)} or more, or a "
@@ -242,7 +243,7 @@ def refuse_too_fine(lengths: Lengths, subject: MeshInput, farthest: float) -> No
 
 def for_mesh(subject: MeshInput) -> int:
     """Bytes of the budget that are not the grid's."""
-    return int((1 - SHARE) * subject.budget_bytes)
+    return int((1 - GRID_BUDGET_SHARE) * subject.budget_bytes)
 
 
 def refuse_too_large(lengths: Lengths, subject: MeshInput, blocks: int) -> None:

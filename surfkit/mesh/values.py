@@ -8,9 +8,9 @@ from surfkit.mesh.base import LENGTHS
 
 WARM_TO_COOL = np.array([[190, 30, 45], [240, 130, 60], [250, 215, 120], [130, 190, 215], [45, 85, 165]], float)
 """sRGB at equal steps, from dark red by pale yellow to dark blue: also those who do not tell red from green see it."""
-UNKNOWN = 128
+UNKNOWN_GREY = 128
 """Grey of vertices whose value is not known."""
-VIEWS = (1.0, 10.0)
+VIEW_COUNT_RANGE = (1.0, 10.0)
 """Photographs at the ends of the colours, the same for all meshes: they can be compared."""
 PERCENTILES = (2, 98)
 """Of lengths, at the ends of the colours."""
@@ -19,7 +19,7 @@ PERCENTILES = (2, 98)
 def ends_of(name: str, values: np.ndarray) -> tuple[float, float]:
     """The values at the ends of the colours, lower one first."""
     if name not in LENGTHS:
-        return VIEWS
+        return VIEW_COUNT_RANGE
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, PERCENTILES) if len(known) else (0.0, 0.0)
     return float(low), float(high)
@@ -41,7 +41,7 @@ def by_value(name: str, values: np.ndarray, ends: tuple[float, float]) -> np.nda
         share = np.log(np.maximum(found, low) / low) / np.log(high / low)
     steps = np.linspace(0, 1, len(WARM_TO_COOL))
     colors = np.stack([np.interp(share, steps, channel) for channel in WARM_TO_COOL.T], axis=1)
-    return np.where(known[:, None], np.rint(colors), UNKNOWN).astype(np.uint8)
+    return np.where(known[:, None], np.rint(colors), UNKNOWN_GREY).astype(np.uint8)
 
 
 def words_of(name: str, ends: tuple[float, float], unit: str) -> str:

@@ -19,9 +19,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.mesh.adjust import adjusted
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.cut_tiles import LAST, UNKNOWN, Decided, Tile, tiles
+from surfkit.mesh.cut_tiles import LAST, UNDECIDED, DecidedTetrahedra, TetraTile, tiles
 from surfkit.mesh.delaunay import Tetrahedra, tetrahedralised
 from surfkit.mesh.holes import close_holes
 from surfkit.mesh.lengths import look, with_unit
@@ -30,8 +30,8 @@ from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which
 from surfkit.mesh.places import SHELL_DEPTH, places_of
-from surfkit.mesh.points import Points, gather
-from surfkit.mesh.sights import Seeing, Sights, boxes_of, for_all, seen
+from surfkit.mesh.points import SurfacePoints, gather
+from surfkit.mesh.sights import ObservationSettings, ViewObservations, boxes_of, for_all, seen
 from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.support import supported
 from surfkit.mesh.trust import Trust
@@ -42,18 +42,18 @@ from surfkit.scene.up_direction import up_of_views
 
 OUTWARD = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 """Corners of the face opposite to each corner of a positively oriented tetrahedron, counter-clockwise from outside."""
-CONFIDENT = 0.25
+MIN_DEPTH_CONFIDENCE = 0.25
 """Confidence of a prior from which its depth counts."""
-POINT_BYTES = 2_000
+TETRA_POINT_BYTES = 2_000
 """Memory that a point takes, with its tetrahedra and the places in these."""
 CELL_BYTES = 500
 """Memory that a cell takes while points are gathered."""
 HALO = 100.0
 """Cells around a tile whose points it has too."""
-CRACK = 12
+MAX_CRACK_EDGES = 12
 """Edges of holes that are closed: where tiles meet, a large tetrahedron may have been divided in two ways."""
-LEAST_POINTS = 4
-CAMERA = 1e3
+MIN_TETRA_POINTS = 4
+CAMERA_CELL_VOLUME = 1e3
 """Volume that a camera stands for in the tetrahedron that holds it, cells."""
 
 
@@ -107,7 +107,9 @@ class Visibility(Mesher):
     sky: bool = False
     """Let the sky count too, as in mesh:tsdf."""
 
-    trust: Annotated[Trust, choice(Trust)] = field(default_factory=partial(Agreement, alone=0.5, covered_by=2))
+    trust: Annotated[Trust, choice(Trust)] = field(
+        default_factory=partial(GeometricConsistency, alone=0.5, covered_by=2)
+    )
     """How far the depth of a pixel that is drawn is trusted."""
 
     doubted: float = 0.05
@@ -198,11 +200,11 @@ class Visibility(Mesher):
         side, limit = self._lengths(subject)
         refuse_too_fine(side, limit, subject)
         subject = oversampled(subject, self.oversampling)
-        how = Seeing(self.depth, limit, self.trust, self.doubted, self.stereo, CONFIDENT)
+        how = ObservationSettings(self.depth, limit, self.trust, self.doubted, self.stereo, MIN_DEPTH_CONFIDENCE)
         with seen(subject, how) as sights:
             most = subject.budget_bytes // CELL_BYTES
             points = gather(sights, side, limit, self.least_weight, self.flat, most)
-            if len(points.places) < LEAST_POINTS:
+            if len(points.places) < MIN_TETRA_POINTS:
                 raise BadInput(
                     f"no surface: of cells of {with_unit(side, subject.frame)}, {len(points.places)} have a depth with "
                     f"the weight of --mesh.least-weight {self.least_weight:g}; lower it, or train for more steps"
@@ -223,7 +225,7 @@ class Visibility(Mesher):
             side, limit = side or self.cell_px * pixel, limit or max(2 * depth, far)
         return side, limit
 
-    def surface(self, sights: Sights, points: Points, side: float, budget_bytes: int = 2**62) -> Mesh:
+    def surface(self, sights: ViewObservations, points: SurfacePoints, side: float, budget_bytes: int = 2**62) -> Mesh:
         """The surface of what views see, without facts.
 
         Args:
@@ -232,11 +234,11 @@ class Visibility(Mesher):
             side: Of a cell, local units.
             budget_bytes: Memory for the tetrahedra of a tile.
         """
-        decided, found = Decided(), []
-        most = budget_bytes // POINT_BYTES
+        decided, found = DecidedTetrahedra(), []
+        most = budget_bytes // TETRA_POINT_BYTES
         parts = tiles(points.places, most, HALO * side)
         if (largest := max(len(tile.rows) for tile in parts)) > most:
-            needed, given = (f"{count * POINT_BYTES / 1e9:.1f} GB" for count in (largest, most))
+            needed, given = (f"{count * TETRA_POINT_BYTES / 1e9:.1f} GB" for count in (largest, most))
             told = f"one tile needs about {needed}, more than the {given} of --memory; a larger --mesh.cell needs less"
             emit(Warned(told))
         for tile in parts:
@@ -251,10 +253,12 @@ class Visibility(Mesher):
         near = side * min(min(camera.fx, camera.fy) for camera in sights.cameras)
         mesh = separated(mesh)
         if len(parts) > 1:
-            mesh, _ = close_holes(mesh, CRACK)
+            mesh, _ = close_holes(mesh, MAX_CRACK_EDGES)
         return apart(adjusted(sights, mesh, side, near, self.smooth))
 
-    def cut(self, sights: Sights, points: Points, side: float, tile: Tile, decided: Decided) -> np.ndarray:
+    def cut(
+        self, sights: ViewObservations, points: SurfacePoints, side: float, tile: TetraTile, decided: DecidedTetrahedra
+    ) -> np.ndarray:
         """(F, 3) rows of all points: the faces of a tile between empty and full tetrahedra, facing outwards.
 
         Args:
@@ -270,7 +274,7 @@ class Visibility(Mesher):
         count = len(tets.corners)
         volumes = np.empty(count)
         native.volumes(tets.points, tets.corners, volumes, threads)
-        owner, shell, starts, places, cells = places_of(points, tets, volumes, side, given == UNKNOWN)
+        owner, shell, starts, places, cells = places_of(points, tets, volumes, side, given == UNDECIDED)
         empty, full = np.zeros(len(places), np.float32), np.zeros(len(places), np.float32)
 
         boxes = boxes_of(places)
@@ -287,7 +291,7 @@ class Visibility(Mesher):
         within = np.maximum(np.diff(starts, append=shell), 1)
         volume = np.bincount(owner[:shell], balance[:shell], count) / within * volumes
         volume += np.bincount(owner[shell:], balance[shell:] * cells, count) * (side**3 * SHELL_DEPTH)
-        volume[self._cameras(sights, tets)] += CAMERA * side**3
+        volume[self._cameras(sights, tets)] += CAMERA_CELL_VOLUME * side**3
         evidence = np.bincount(owner[:shell], votes[:shell], count) / within
         looked = np.bincount(owner[shell:], minlength=count)
         evidence = np.maximum(evidence, np.bincount(owner[shell:], votes[shell:], count) / np.maximum(looked, 1))
@@ -316,7 +320,7 @@ class Visibility(Mesher):
         of = tile.tile_of[faces]
         return tile.rows[faces[(of.min(1) == tile.number) & (of.max(1) < LAST)]]
 
-    def _cameras(self, sights: Sights, tets: Tetrahedra) -> np.ndarray:
+    def _cameras(self, sights: ViewObservations, tets: Tetrahedra) -> np.ndarray:
         """Numbers of the tetrahedra that hold a camera: they are empty."""
         centres = np.stack([camera.centre.numpy() for camera in sights.cameras]).astype(np.float64)
         found, start = np.empty(len(centres), np.int32), np.zeros(len(centres), np.int32)

@@ -10,7 +10,7 @@ from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, CoarseModel, Partition
 from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
-from surfkit.partition.sparse_points import SparsePoints
+from surfkit.partition.sparse_points import SparsePointShare
 from surfkit.partition.square_grid import SquareGrid
 
 
@@ -26,7 +26,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "ssim-difference": SSIMDifference,
         "picture-share": PictureShare,
         "airspace": Airspace,
-        "sparse-points": SparsePoints,
+        "sparse-points": SparsePointShare,
     }
 
 

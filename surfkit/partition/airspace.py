@@ -13,11 +13,11 @@ from surfkit.partition.assign import Assign, check_threshold, inside
 from surfkit.partition.base import Cells, CoarseModel, Ground
 from surfkit.scene.camera import Camera
 
-SIDE = 48
+RAYS_PER_SIDE = 48
 """Rays along each side of a picture."""
-MOST = 0.99
+MIN_CONTAINED_SHARE = 0.99
 """Share of a block's points, along each axis, that its space must hold."""
-LEVEL = 1e-12
+MIN_RAY_SLOPE = 1e-12
 """A ray rises at least this much along each axis of the ground, per unit of depth."""
 
 
@@ -64,7 +64,7 @@ class Airspace(Assign):
     def _space(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """(3,) lower and upper corner, along the axes of the ground, of what holds (N, 3) places."""
         ranked = places.sort(0).values
-        cut = int((1 - MOST) / 2 * len(ranked))
+        cut = int((1 - MIN_CONTAINED_SHARE) / 2 * len(ranked))
         low, high = ranked[cut], ranked[len(ranked) - 1 - cut]
         margin = self.growth / 2 * (high - low) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         return low - margin, high + margin
@@ -82,9 +82,9 @@ def filled(camera: Camera, axes: Tensor, low: Tensor, high: Tensor) -> float:
     eye = axes @ camera.centre
     if ((eye >= low) & (eye <= high))[:2].all():
         return 1.0
-    rays = camera.resized(SIDE, SIDE).rays(torch.float64).flatten(1)
+    rays = camera.resized(RAYS_PER_SIDE, RAYS_PER_SIDE).rays(torch.float64).flatten(1)
     steps = axes @ camera.world_to_camera[:3, :3].T @ rays
-    steps = torch.where(steps.abs() < LEVEL, LEVEL, steps)
+    steps = torch.where(steps.abs() < MIN_RAY_SLOPE, MIN_RAY_SLOPE, steps)
     sides = torch.stack([low - eye, high - eye])[:, :, None] / steps
     enter, leave = sides.amin(0).amax(0), sides.amax(0).amin(0)
     return float(((leave > 0) & (enter <= leave)).double().mean())

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.partition.base import Box, Cells, CoarseModel, Ground, Partition
 
-FINE = 48
+STRIPS_PER_AXIS = 48
 """Strips along each axis between whose borders cuts are sought."""
 
 
@@ -38,11 +38,13 @@ class Balanced(Partition):
             raise BadInput(
                 f"partition: {len(sight.splats):,} points cannot make {self.count} blocks; lower balanced.count"
             )
-        load = Load.of(sight, ground, self.threshold)
+        load = StripWorkload.of(sight, ground, self.threshold)
         boxes = self._cut(load, (0, 0, *load.counts.shape), self.count)
         return Cells(ground, tuple(load.box(strips) for strips in boxes), tuple(range(len(boxes))))
 
-    def _cut(self, load: Load, strips: tuple[int, int, int, int], count: int) -> list[tuple[int, int, int, int]]:
+    def _cut(
+        self, load: StripWorkload, strips: tuple[int, int, int, int], count: int
+    ) -> list[tuple[int, int, int, int]]:
         """Cut a box of strips into `count`, where the halves' work is most nearly in the ratio of their counts."""
         if count == 1:
             return [strips]
@@ -61,7 +63,7 @@ class Balanced(Partition):
 
 
 @dataclass(frozen=True)
-class Load:
+class StripWorkload:
     """Where points lie and what views look at, on strips with equally many points.
 
     Attributes:
@@ -79,10 +81,10 @@ class Load:
     threshold: float
 
     @classmethod
-    def of(cls, sight: CoarseModel, ground: Ground, threshold: float) -> Load:
+    def of(cls, sight: CoarseModel, ground: Ground, threshold: float) -> StripWorkload:
         """Look once through every view."""
         flat = ground.flat(sight.splats.means)
-        parts = torch.arange(1, FINE) * len(flat) // FINE
+        parts = torch.arange(1, STRIPS_PER_AXIS) * len(flat) // STRIPS_PER_AXIS
         borders = tuple(flat[:, axis].sort().values[parts].unique() for axis in (0, 1))
         x, y = (torch.bucketize(flat[:, axis].contiguous(), side, right=True) for axis, side in enumerate(borders))
         wide, high = len(borders[0]) + 1, len(borders[1]) + 1

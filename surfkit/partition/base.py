@@ -18,7 +18,7 @@ from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Frame, View
 
-UPRIGHT = math.cos(math.radians(25))
+MIN_ALIGNED_COSINE = math.cos(math.radians(25))
 """A ground this close to two axes of the frame is taken to lie along them."""
 
 Box = tuple[float | None, float | None, float | None, float | None]
@@ -51,7 +51,7 @@ class Ground:
         if in_line or up_and_down:
             axes = others
         up = axes[:, 0]
-        if float(up.abs().max()) >= UPRIGHT:
+        if float(up.abs().max()) >= MIN_ALIGNED_COSINE:
             flat = [axis for axis in range(3) if axis != int(up.abs().argmax())]
             axes = torch.eye(3, dtype=torch.float64)[:, flat]
         else:

@@ -7,9 +7,9 @@ import torch
 
 from surfkit.partition.base import Cells
 
-FINE = 4096
+FINE_SIDE_PLACES = 4096
 """Places looked at along each side of a cell before they are spread evenly: the contraction bends and stretches it."""
-MOST = 200_000
+MAX_SIDE_PLACES = 200_000
 """Places along each side of a cell."""
 
 
@@ -32,8 +32,8 @@ def border_places(cells: Cells, low: np.ndarray, high: np.ndarray, step: float) 
             begin, end = (
                 ends[at][other] if side is None else side for at, side in enumerate((box[other], box[other + 2]))
             )
-            line = np.empty((FINE, 2))
-            line[:, axis], line[:, other] = box[axis], np.linspace(begin, end, FINE)
+            line = np.empty((FINE_SIDE_PLACES, 2))
+            line[:, axis], line[:, other] = box[axis], np.linspace(begin, end, FINE_SIDE_PLACES)
             found.append(_between(cells, line, (axis, block), step))
     places = np.concatenate(found) if found else np.empty((0, 2))
     return places[((places >= low) & (places <= high)).all(1)]
@@ -64,7 +64,7 @@ def _between(cells: Cells, line: np.ndarray, lower: tuple[int, int], step: float
         line = _stretched(cells, line)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.linspace(0, along[-1], min(MOST, int(along[-1] / step) + 2))
+    at = np.linspace(0, along[-1], min(MAX_SIDE_PLACES, int(along[-1] / step) + 2))
     spread = np.stack([np.interp(at, along, line[:, i]) for i in (0, 1)], axis=1)
     return spread[kept[np.searchsorted(along, at).clip(max=len(line) - 1)]]
 

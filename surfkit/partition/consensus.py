@@ -11,12 +11,12 @@ from torch import Tensor
 from surfkit.losses.consensus import Consensus, column
 from surfkit.primitives.points import Columns
 
-FACTOR = 2.0
+RHO_FACTOR = 2.0
 """By which rho is changed."""
 
 
 @dataclass(frozen=True)
-class Copies:
+class PointCopies:
     """The points of one block.
 
     Attributes:
@@ -35,7 +35,7 @@ class Copies:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ConsensusState:
     """What blocks have agreed on at the end of a round.
 
     Attributes:
@@ -49,7 +49,7 @@ class Agreement:
     rho: dict[str, float]
 
 
-def mean_copies(blocks: Sequence[Copies], ids: Tensor) -> tuple[Columns, Tensor]:
+def mean_copies(blocks: Sequence[PointCopies], ids: Tensor) -> tuple[Columns, Tensor]:
     """Mean of all copies of (M,) points, zeros where there is none; (M,) how many copies there are."""
     counts, sums = torch.zeros(len(ids), dtype=torch.int64), {}
     for block in blocks:
@@ -69,7 +69,7 @@ def common(ids: Sequence[Tensor]) -> Tensor:
     return every[counts > 1]
 
 
-def agree(blocks: Sequence[Copies], rule: Consensus, before: Agreement | None, index: int) -> Agreement:
+def agree(blocks: Sequence[PointCopies], rule: Consensus, before: ConsensusState | None, index: int) -> ConsensusState:
     """What blocks agree on after step `index`.
 
     Args:
@@ -81,26 +81,26 @@ def agree(blocks: Sequence[Copies], rule: Consensus, before: Agreement | None, i
     ids = common([block.ids for block in blocks]) if before is None else before.ids
     z, counts = mean_copies(blocks, ids)
     if before is None:
-        return Agreement(ids, z, {name: rule.begins_with(name) / max(1, len(ids)) for name in z})
+        return ConsensusState(ids, z, {name: rule.begins_with(name) / max(1, len(ids)) for name in z})
     rho = dict(before.rho)
     for name in z if index <= rule.balance_until else ():
         apart = sum(_squares(block, before.ids, z, name) for block in blocks) ** 0.5
         moved = (z[name].double() - before.z[name].double()).reshape(len(counts), -1).square().sum(1)
         change = rho[name] * float((counts * moved).sum()) ** 0.5
         if apart > rule.balance * change:
-            rho[name] *= FACTOR
+            rho[name] *= RHO_FACTOR
         elif change > rule.balance * apart:
-            rho[name] /= FACTOR
-    return Agreement(before.ids, z, rho)
+            rho[name] /= RHO_FACTOR
+    return ConsensusState(before.ids, z, rho)
 
 
-def _squares(block: Copies, ids: Tensor, z: Columns, name: str) -> float:
+def _squares(block: PointCopies, ids: Tensor, z: Columns, name: str) -> float:
     """Sum of the squares of the differences between the copies in a block and the means."""
     rows, at = block.of(ids)
     return float((block.params[name][rows].double() - z[name][at].double()).square().sum())
 
 
-def columns_after(block: Copies, stats: Columns, agreement: Agreement, rule: Consensus) -> Columns:
+def columns_after(block: PointCopies, stats: Columns, agreement: ConsensusState, rule: Consensus) -> Columns:
     """The columns of `Consensus` in a block for the next round, from those of the round before; none at the first.
 
     The sum u is in units of 1 / rho, and changes with it.

@@ -15,7 +15,7 @@ Pieces = Callable[[], Iterator[Mapping[str, Tensor]]]
 
 
 @dataclass(frozen=True)
-class Share:
+class BlockContribution:
     """What one block gives to the whole.
 
     Attributes:
@@ -59,11 +59,11 @@ class Merge:
             names = ", ".join(map(str, missing))
             raise BadInput(f"merge: blocks {names} are not tuned; give the same command again to finish them")
 
-    def shares(self) -> tuple[Share, ...]:
+    def shares(self) -> tuple[BlockContribution, ...]:
         """What each block gives."""
         counts = [[(len(own), int(own.sum())) for _, own in self._owned(index)] for index in range(self.cells.count)]
         sums = [(sum(given for given, _ in parts), sum(kept for _, kept in parts)) for parts in counts]
-        return tuple(Share(index, index not in self.tuned, *both) for index, both in enumerate(sums))
+        return tuple(BlockContribution(index, index not in self.tuned, *both) for index, both in enumerate(sums))
 
     def pieces(self) -> Iterator[dict[str, Tensor]]:
         """The parameters, in the order of the blocks."""

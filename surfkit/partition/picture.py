@@ -11,29 +11,37 @@ from torch import Tensor
 
 from surfkit.core.files import replacing
 from surfkit.partition.base import CoarseModel
-from surfkit.partition.plan import Plan
+from surfkit.partition.plan import PartitionPlan
 
-SIDE = 1000
+PLOT_SIDE_PX = 1000
 """Pixels of the longer side."""
-COLORS = ((31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75), (227, 119, 194))
-SHOWN = 0.99
+BLOCK_COLORS = (
+    (31, 119, 180),
+    (255, 127, 14),
+    (44, 160, 44),
+    (214, 39, 40),
+    (148, 103, 189),
+    (140, 86, 75),
+    (227, 119, 194),
+)
+SHOWN_POINT_SHARE = 0.99
 """Share of the points, along each axis, that decides what is in the picture."""
-MOST = 200_000
+MAX_PLOTTED_POINTS = 200_000
 
 
-def plan_picture(path: Path, sight: CoarseModel, plan: Plan) -> None:
+def plan_picture(path: Path, sight: CoarseModel, plan: PartitionPlan) -> None:
     """Draw points in the colour of their block, cameras as rings, and the number of each block in the middle of it."""
     ground = plan.cells.ground
     points, cameras = ground.flat(sight.splats.means), ground.flat(sight.centres)
     low, high = _bounds(points, cameras)
-    pixels = SIDE / float((high - low).max())
+    pixels = PLOT_SIDE_PX / float((high - low).max())
     width, height = (max(1, round(float(side) * pixels)) for side in high - low)
     owner = plan.cells.owner(sight.splats.means)
-    every = max(1, len(points) // MOST)
+    every = max(1, len(points) // MAX_PLOTTED_POINTS)
     picture = np.full((height, width, 3), 255, np.uint8)
     at = ((points - low) * pixels).floor().long()[::every]
     inside = ((at >= 0) & (at < torch.tensor([width, height]))).all(1) & (owner[::every] >= 0)
-    colors = np.array(COLORS, np.uint8)[owner[::every][inside].numpy() % len(COLORS)]
+    colors = np.array(BLOCK_COLORS, np.uint8)[owner[::every][inside].numpy() % len(BLOCK_COLORS)]
     picture[height - 1 - at[inside, 1].numpy(), at[inside, 0].numpy()] = colors
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image)
@@ -54,7 +62,7 @@ def plan_picture(path: Path, sight: CoarseModel, plan: Plan) -> None:
 def _bounds(points: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor]:
     """Lower and upper corner of what holds the cameras and nearly all points."""
     ranked = points.sort(0).values
-    cut = int((1 - SHOWN) / 2 * len(points))
+    cut = int((1 - SHOWN_POINT_SHARE) / 2 * len(points))
     low = torch.minimum(ranked[cut], cameras.amin(0))
     high = torch.maximum(ranked[len(points) - 1 - cut], cameras.amax(0))
     margin = 0.03 * (high - low).max().clamp_min(1e-9)

@@ -12,12 +12,12 @@ from surfkit.core.events import Warned, emit
 from surfkit.partition.assign import Assign, inside
 from surfkit.partition.base import Cells, CoarseModel, Partition
 
-LOOKS = 16
+COUNTING_VIEWS = 16
 """Views by which the points around a block are counted."""
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockPlan:
     """One block.
 
     Attributes:
@@ -38,7 +38,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Plan:
+class PartitionPlan:
     """How a scene is cut, and who trains on what.
 
     Attributes:
@@ -47,7 +47,7 @@ class Plan:
     """
 
     cells: Cells
-    blocks: tuple[Block, ...]
+    blocks: tuple[BlockPlan, ...]
 
     def __post_init__(self) -> None:
         if [block.index for block in self.blocks] != list(range(self.cells.count)):
@@ -55,7 +55,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Fewest:
+class BlockMinimums:
     """How many views and points a block needs.
 
     Attributes:
@@ -77,9 +77,9 @@ def plan(
     sight: CoarseModel,
     partition: Partition,
     assign: Assign,
-    fewest: Fewest | None = None,
+    fewest: BlockMinimums | None = None,
     begun: CoarseModel | None = None,
-) -> Plan:
+) -> PartitionPlan:
     """Cut, find the views of every block, and join blocks with too few of them to their neighbours.
 
     Args:
@@ -98,12 +98,12 @@ def plan(
     if not joins.any():
         raise BadInput("partition: no view shows any block; lower the threshold of the assignment")
     here = inside(sight, cells) & joins
-    fewest = fewest or Fewest()
+    fewest = fewest or BlockMinimums()
     poor = torch.bincount(owner, minlength=cells.count) < fewest.points * len(owner) / cells.count
     cells, joins, here = with_enough(cells, joins, here, fewest.of(len(sight.views), cells.count), poor)
     if assign.most_views is not None:
         joins = thinned(joins, assign.most_views, sight.seed)
-    return Plan(cells, blocks_of(begun or sight, cells, joins, here & joins))
+    return PartitionPlan(cells, blocks_of(begun or sight, cells, joins, here & joins))
 
 
 def thinned(joins: Tensor, most: int, seed: int) -> Tensor:
@@ -114,7 +114,7 @@ def thinned(joins: Tensor, most: int, seed: int) -> Tensor:
     return joins & (order < most)
 
 
-def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:
+def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[BlockPlan, ...]:
     """What there is to say of every block, from (V, B) views that join and that stand inside."""
     owner = cells.owner(sight.splats.means)
     points = torch.bincount(owner, minlength=cells.count)
@@ -122,7 +122,7 @@ def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -
     share = (work / work.sum().clamp_min(1)).tolist()
     names = [view.name for view in sight.views]
     return tuple(
-        Block(
+        BlockPlan(
             index,
             tuple(name for name, here in zip(names, joins[:, index].tolist(), strict=True) if here),
             int(inside[:, index].sum()),
@@ -137,7 +137,7 @@ def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -
 def begins(sight: CoarseModel, own: Tensor, joins: Tensor) -> int:
     """Points that a block begins with, by (N,) those that it owns and what some of its (V,) views show."""
     views, seen = joins.nonzero()[:, 0].tolist(), own.clone()
-    for at in views[:: -(-len(views) // LOOKS) or 1]:
+    for at in views[:: -(-len(views) // COUNTING_VIEWS) or 1]:
         seen |= sight.rasterizer.render(sight.splats, sight.views[at].camera, sight.near, geometry=False).seen
     return int(seen.sum())
 

@@ -15,7 +15,7 @@ from surfkit.partition.base import Cells, CoarseModel
 
 
 @dataclass(frozen=True)
-class SparsePoints(Assign):
+class SparsePointShare(Assign):
     """How many sparse points of the block a view shows, and where it stands; partly by chance (Hierarchical 3DGS).
 
     A view whose camera is in the block joins if it shows more than `points` of its sparse points. One in a box `growth`

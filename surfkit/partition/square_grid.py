@@ -13,9 +13,9 @@ from surfkit.partition.grid import product
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame
 
-MOST = 10_000
+MAX_GRID_CELLS = 10_000
 """Cells."""
-ROUNDING = 1e-9
+CELL_ROUNDING = 1e-9
 """A box longer than a whole number of cells by no more than this share of one needs no further cell."""
 
 
@@ -59,11 +59,11 @@ class SquareGrid(Partition):
             raise BadInput(
                 "partition: the cameras stand in one place; give square-grid.side in metres, or partition:none"
             )
-        counts = [max(1, math.ceil(float(length) / side - ROUNDING)) for length in size]
-        if counts[0] * counts[1] > MOST:
+        counts = [max(1, math.ceil(float(length) / side - CELL_ROUNDING)) for length in size]
+        if counts[0] * counts[1] > MAX_GRID_CELLS:
             raise BadInput(
                 f"partition: square-grid.side {self.side} makes {counts[0]:,} x {counts[1]:,} cells, and at most "
-                f"{MOST:,} are allowed; give a longer side"
+                f"{MAX_GRID_CELLS:,} are allowed; give a longer side"
             )
         middles = ((low + high) / 2).tolist()
         borders = (

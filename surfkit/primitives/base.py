@@ -16,9 +16,9 @@ from surfkit.io.splats.table import SplatTable
 from surfkit.primitives.columns import SIGMOID, Activation, Column
 from surfkit.primitives.points import Columns
 from surfkit.primitives.raw import cloud_of, raw_columns
-from surfkit.raster.api import KINDS, Rasterizer, Render, Splats
+from surfkit.raster.api import PRIMITIVE_KINDS, Rasterizer, Render, Splats
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 SHRINK = 1.6
 """A child of a split is smaller than its parent by this factor."""
@@ -55,7 +55,7 @@ class Primitive(Component):
         """The trainable parameters by name; `standard_columns` gives those of 3DGS."""
 
     @abstractmethod
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """Raw parameters of a point for each of a cloud, and the shared ones; `init.seeds` gives the standard ones."""
 
     @abstractmethod
@@ -158,10 +158,10 @@ class Primitive(Component):
         """The points as PLY files of splats hold them, local frame; BadInput where `in_ply` is not set."""
         with torch.no_grad():
             splats = self.activate(params, self.sh_degree)
-            if not self.in_ply or splats.kind not in KINDS:
+            if not self.in_ply or splats.kind not in PRIMITIVE_KINDS:
                 raise BadInput(
                     f"primitive {kebab(type(self).__name__)}: PLY files of splats have no place for it, only for "
-                    f"{'s and '.join(KINDS)}s; the checkpoint in the run folder holds the model"
+                    f"{'s and '.join(PRIMITIVE_KINDS)}s; the checkpoint in the run folder holds the model"
                 )
             exact = "opacities" in params and torch.equal(SIGMOID.value(params["opacities"]), splats.opacities)
             return SplatTable(

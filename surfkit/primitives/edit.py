@@ -78,12 +78,12 @@ class Edit:
         return drop, clone + (0 if self.new is None else len(self.new)), split
 
 
-FLOATS = (torch.float32, torch.float64)
-ROWS: dict[str, tuple[tuple[torch.dtype, ...], tuple[int, ...]]] = {
+FLOAT_DTYPES = (torch.float32, torch.float64)
+ROW_FIELDS: dict[str, tuple[tuple[torch.dtype, ...], tuple[int, ...]]] = {
     **dict.fromkeys(("drop", "split", "forget", "scatter"), ((torch.bool,), ())),
     "clone": ((torch.bool, torch.int64), ()),
-    "move": (FLOATS, (3,)),
-    **dict.fromkeys(("opacities", "scale_by"), (FLOATS, ())),
+    "move": (FLOAT_DTYPES, (3,)),
+    **dict.fromkeys(("opacities", "scale_by"), (FLOAT_DTYPES, ())),
 }
 """Types of what an edit has for each of N points, and their shapes after N."""
 
@@ -119,7 +119,7 @@ def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
     name = f"{type(policy).__module__}.{type(policy).__qualname__}.edit"
     if not isinstance(edit, Edit):
         raise BadInput(f"{name} gives {type(edit).__name__}; it must be a surfkit.Edit, or None")
-    for field, (kinds, shape) in ROWS.items():
+    for field, (kinds, shape) in ROW_FIELDS.items():
         value, wanted = getattr(edit, field), (count, *shape)
         if value is None:
             continue

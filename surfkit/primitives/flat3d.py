@@ -13,7 +13,7 @@ from surfkit.primitives.columns import SIGMOID, Column, standard_columns
 from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Flat3D(Primitive):
         """The standard ones."""
         return standard_columns(2, self.sh_degree)
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """Thin discs facing along the cloud's normals, or any way when it has none."""
         params = seeds(self.columns(), cloud)
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)

@@ -14,7 +14,7 @@ from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Columns
 from surfkit.primitives.smoothing import Smoothable
 from surfkit.raster.api import DILATION, Splats
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Gaussian3D(Smoothable, Primitive):
         """The standard ones, and the sampling intervals if scales are smoothed."""
         return self.smoothable_columns(3)
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """Balls."""
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
         return seeds(self.columns(), cloud) | {"quats": quats} | self.unobserved(len(quats))

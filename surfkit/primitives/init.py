@@ -11,19 +11,19 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import Column
 from surfkit.primitives.points import Columns
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
-OPACITY = 0.1
+DEFAULT_OPACITY = 0.1
 """Opacity of a new point, where its cloud names none."""
-SMALLEST = 1e-5
+MIN_POINT_SIZE = 1e-5
 """Smallest size of a new point, local units: 1 cm in a scene of 1 km."""
-ALONE = 0.01
+LONE_POINT_SIZE = 0.01
 """Size of a new point without neighbours, local units."""
 
 
-def seeds(columns: Mapping[str, Column], cloud: Cloud) -> Columns:
+def seeds(columns: Mapping[str, Column], cloud: SparsePoints) -> Columns:
     """The standard raw columns but the rotations: one point per cloud point, round, of its colour and opacity.
 
     Args:
@@ -34,8 +34,10 @@ def seeds(columns: Mapping[str, Column], cloud: Cloud) -> Columns:
     count = len(cloud.xyz)
     if count == 0:
         raise BadInput("the scene has no sparse points to start from; triangulate some (COLMAP point_triangulator)")
-    sizes = gaps(cloud.xyz) if cloud.size is None else cloud.size.float().clamp_min(SMALLEST)
-    opacities = torch.full((count,), OPACITY, dtype=torch.float64) if cloud.opacity is None else cloud.opacity.float()
+    sizes = gaps(cloud.xyz) if cloud.size is None else cloud.size.float().clamp_min(MIN_POINT_SIZE)
+    opacities = (
+        torch.full((count,), DEFAULT_OPACITY, dtype=torch.float64) if cloud.opacity is None else cloud.opacity.float()
+    )
     activated = {
         "means": cloud.xyz.float().clone(),
         "scales": sizes,
@@ -65,10 +67,10 @@ def gaps(xyz: Tensor) -> Tensor:
     places, back = np.unique(xyz.double().cpu().numpy(), axis=0, return_inverse=True)
     near = min(3, len(places) - 1)
     if near == 0:
-        return torch.full((len(xyz),), ALONE)
+        return torch.full((len(xyz),), LONE_POINT_SIZE)
     distances, _ = cKDTree(places).query(places, k=near + 1)
     sizes = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
-    return torch.from_numpy(sizes[back.reshape(-1)]).float().clamp_min(SMALLEST)
+    return torch.from_numpy(sizes[back.reshape(-1)]).float().clamp_min(MIN_POINT_SIZE)
 
 
 def facing(normals: Tensor) -> Tensor:

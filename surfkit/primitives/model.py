@@ -14,7 +14,7 @@ from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 
-NEAR = 0.005
+DEFAULT_NEAR = 0.005
 """Nothing nearer to a camera is drawn, local units, where a method says nothing else."""
 
 
@@ -32,7 +32,7 @@ class SplatModel:
     primitive: Primitive
     params: Columns
     sh_degree: int = 0
-    near: float = NEAR
+    near: float = DEFAULT_NEAR
 
     def __len__(self) -> int:
         return len(self.params["means"])

@@ -12,7 +12,7 @@ from surfkit.io.splats.table import SplatTable
 from surfkit.primitives.columns import EXP, RATES, SIGMOID, Column
 from surfkit.primitives.init import SH_C0
 from surfkit.primitives.points import Columns
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 TURNS = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5))
 """Quaternions wxyz that make the first, and the second, of three axes the third: turns of 120 degrees."""
@@ -80,9 +80,9 @@ def product(first: Tensor, second: Tensor) -> Tensor:
     return torch.cat([scalar, w * v + second[0] * axis + torch.linalg.cross(axis, v.expand_as(axis))], 1)
 
 
-def cloud_of(table: SplatTable) -> Cloud:
+def cloud_of(table: SplatTable) -> SparsePoints:
     """Points at the splats, with what a cloud knows of each: colour from everywhere, opacity and mean size."""
     rgb = (255 * (0.5 + SH_C0 * table.sh0)).round().clamp(0, 255).to(torch.uint8)
     opacity = table.opacity_logits.float().sigmoid().clamp(1e-6, 1 - 1e-6)
     size = table.log_scales.float().topk(2, 1).values.mean(1).exp()
-    return Cloud(table.means.float(), rgb, opacity=opacity, size=size)
+    return SparsePoints(table.means.float(), rgb, opacity=opacity, size=size)

@@ -17,9 +17,9 @@ from surfkit.scene.camera import Camera
 
 INTERVAL = "interval"
 """Column with the sampling interval of each point: its smallest distance between pixels in any training view."""
-HIGHEST = 0.9999
+MAX_PREFILTER_OPACITY = 0.9999
 """Opacity before the filter that can be asked for: after it, that of a small splat is lower."""
-MARGIN = 0.15
+MAX_OUTSIDE_SHARE = 0.15
 """A point this share of an image beside it still counts as seen, as its footprint may reach in."""
 
 
@@ -47,7 +47,7 @@ class Smoothable:
     def with_opacities(self, params: Columns, opacities: Tensor) -> Columns:
         """See `Primitive.with_opacities`: `opacities` are those after the filter, as far as there are such."""
         if self.smoothing:
-            opacities = (opacities / self._kept(params).detach()).clamp_max(HIGHEST)
+            opacities = (opacities / self._kept(params).detach()).clamp_max(MAX_PREFILTER_OPACITY)
         return Primitive.with_opacities(self, params, opacities)
 
     def smoothable_columns(self, axes: int) -> dict[str, Column]:
@@ -88,7 +88,7 @@ def sampling_intervals(means: Tensor, cameras: Sequence[Camera], near: float) ->
         down = y / z * camera.fy + camera.cy, camera.height
         seen = z > near
         for at, size in (across, down):
-            seen &= (at >= -MARGIN * size) & (at <= (1 + MARGIN) * size)
+            seen &= (at >= -MAX_OUTSIDE_SHARE * size) & (at <= (1 + MAX_OUTSIDE_SHARE) * size)
         smallest = torch.where(seen, torch.minimum(smallest, z / max(camera.fx, camera.fy)), smallest)
     known = smallest.isfinite()
     largest = smallest[known].max() if known.any() else smallest.new_zeros(())

@@ -12,7 +12,7 @@ from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.primitives.smoothing import Smoothable
 from surfkit.raster.api import Splats
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Surfel2D(Smoothable, Primitive):
         """The standard ones, and the sampling intervals if scales are smoothed."""
         return self.smoothable_columns(2)
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """Discs facing along the cloud's normals, or any way when it has none."""
         params = seeds(self.columns(), cloud)
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)  # uniform over all rotations

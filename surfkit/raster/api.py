@@ -43,7 +43,7 @@ DILATION = 0.3
 EDGE_ON = 2e-3
 """Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
 
-KINDS = ("surfel", "gaussian")
+PRIMITIVE_KINDS = ("surfel", "gaussian")
 """What the rasterizers of surfkit draw: flat discs (2DGS) and ellipsoids (3DGS)."""
 
 GEOMETRIES = ("axis", "plane", "ray")

@@ -22,7 +22,7 @@ LOW_PASS_SIGMA = 3.0
 
 
 @dataclass(frozen=True)
-class Footprints:
+class ProjectedSplats:
     """N splats on the image plane.
 
     Attributes:
@@ -51,7 +51,7 @@ class Footprints:
     normals: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
 
 
-def footprints(splats: Splats, camera: Camera, near: float) -> Footprints:
+def footprints(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     """Project splats of any kind and geometry."""
     if splats.kind == "surfel":
         return surfels(splats, camera, near)
@@ -100,7 +100,7 @@ def clamped(z: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return torch.where(inside, torch.where(inside, z, low), torch.where(z > high, high, low).detach())
 
 
-def surfels(splats: Splats, camera: Camera, near: float) -> Footprints:
+def surfels(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     """Project discs (2DGS, section 4.2)."""
     to_camera = camera.world_to_camera.to(splats.means)
     turn = to_camera[:3, :3]
@@ -161,10 +161,10 @@ def surfels(splats: Splats, camera: Camera, near: float) -> Footprints:
         return rho, clamped(depth, z_low[rows], z_high[rows]), splats.opacities[rows][:, None]
 
     normal = facing(axes[:, :, 2], centre.detach())
-    return Footprints(drawn, centre[:, 2], colors(splats, camera), normal, middle, half, radius, screen, at)
+    return ProjectedSplats(drawn, centre[:, 2], colors(splats, camera), normal, middle, half, radius, screen, at)
 
 
-def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
+def gaussians(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     """Project ellipsoids (3DGS, section 4) with their depth along the ray to first order."""
     to_camera = camera.world_to_camera.to(splats.means)
     turn = to_camera[:3, :3]
@@ -222,10 +222,12 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
         size = upright.norm(dim=1, keepdim=True)
         normal = torch.where(size > 0, -upright / torch.where(size > 0, size, 1.0), normal)
     radius = half.amax(1)
-    return Footprints(drawn, centre[:, 2], colors(splats, camera), normal, screen.detach(), half, radius, screen, at)
+    return ProjectedSplats(
+        drawn, centre[:, 2], colors(splats, camera), normal, screen.detach(), half, radius, screen, at
+    )
 
 
-def along_rays(splats: Splats, camera: Camera, near: float) -> Footprints:
+def along_rays(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     """Ellipsoids evaluated in space at the largest density along each ray (GOF, section 4.1).
 
     In the frame in which the ellipsoid is the unit sphere the ray is o + t r with A = r.r, B = 2 o.r, C = o.o: depth is
@@ -282,4 +284,4 @@ def along_rays(splats: Splats, camera: Camera, near: float) -> Footprints:
     normal = facing(axes[torch.arange(len(z)), :, scales.argmin(1)], centre.detach())
     radius = half.amax(1)
     middle = screen.detach() + off
-    return Footprints(drawn, z, colors(splats, camera), normal, middle, half, radius, screen, at, normals)
+    return ProjectedSplats(drawn, z, colors(splats, camera), normal, middle, half, radius, screen, at, normals)

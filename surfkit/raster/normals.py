@@ -45,7 +45,7 @@ def disagreement(depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -
         camera: That the maps were rendered for.
     """
     if native.module() is not None and depth.device.type == "cpu" and depth.dtype == torch.float32:
-        return _Fused.apply(depth, alpha, normal, camera)
+        return _FusedNormals.apply(depth, alpha, normal, camera)
     return disagreement_reference(depth, alpha, normal, camera)
 
 
@@ -58,7 +58,7 @@ def disagreement_reference(depth: Tensor, alpha: Tensor, normal: Tensor, camera:
     return ((1 - agreement) * valid).sum() / valid.numel()
 
 
-class _Fused(torch.autograd.Function):
+class _FusedNormals(torch.autograd.Function):
     """Value and gradients in one native pass."""
 
     @staticmethod

@@ -10,11 +10,11 @@ from torch import Tensor
 from surfkit.raster.api import CUTOFF, Splats
 from surfkit.scene.camera import Camera
 
-MARGIN_PX = 3.0
+SPLAT_MARGIN_PX = 3.0
 """Pixels beyond the image at which a splat may still touch it: the low-pass filter of a disc reaches 2.36."""
-HELD = 0.15
+HELD_SLOPE_SHARE = 0.15
 """Share of the image beyond its sides at which the slope of the footprint of a Gaussian is held."""
-ROUNDING = 1e-3
+BOUND_ROUNDING = 1e-3
 """Share by which bounds are widened, for what float32 rounds."""
 
 
@@ -29,28 +29,28 @@ def may_touch(splats: Splats, camera: Camera, near: float) -> Tensor:
         near: As in `Rasterizer.render`.
     """
     pose = camera.world_to_camera.to(splats.means)
-    reach = splats.scales.amax(1) * (CUTOFF * (1 + ROUNDING))
+    reach = splats.scales.amax(1) * (CUTOFF * (1 + BOUND_ROUNDING))
     if splats.kind == "gaussian" and splats.geometry != "ray":
         return _blurred(splats, splats.means @ pose[:3, :3].T + pose[:3, 3], reach, camera, near)
-    left, top = -MARGIN_PX - camera.cx, -MARGIN_PX - camera.cy
-    right, bottom = camera.width + MARGIN_PX - camera.cx, camera.height + MARGIN_PX - camera.cy
+    left, top = -SPLAT_MARGIN_PX - camera.cx, -SPLAT_MARGIN_PX - camera.cy
+    right, bottom = camera.width + SPLAT_MARGIN_PX - camera.cx, camera.height + SPLAT_MARGIN_PX - camera.cy
     # Planes through the camera and the sides of the image, pointing away, and then the depth.
     away = [[-camera.fx, 0, left], [camera.fx, 0, -right], [0, -camera.fy, top], [0, camera.fy, -bottom]]
     planes = torch.tensor([*([value / math.hypot(*plane) for value in plane] for plane in away), [0.0, 0.0, 1.0]])
     planes = planes.to(pose)
     beyond = torch.addmm(planes @ pose[:3, 3], splats.means, (planes @ pose[:3, :3]).T)
-    return (beyond[:, :4] <= reach[:, None]).all(1) & (beyond[:, 4] > (1 - ROUNDING) * near)
+    return (beyond[:, :4] <= reach[:, None]).all(1) & (beyond[:, 4] > (1 - BOUND_ROUNDING) * near)
 
 
 def _blurred(splats: Splats, centre: Tensor, reach: Tensor, camera: Camera, near: float) -> Tensor:
     """The same for footprints by EWA splatting: affine in the covariance, at a slope that is held near the image."""
     x, y, z = centre.unbind(1)
-    ahead = z > (1 - ROUNDING) * near
+    ahead = z > (1 - BOUND_ROUNDING) * near
     z = torch.where(ahead, z, 1.0)
-    more = CUTOFF * math.sqrt(splats.dilation) + MARGIN_PX
+    more = CUTOFF * math.sqrt(splats.dilation) + SPLAT_MARGIN_PX
 
     def inside(slope: Tensor, focal: float, principal: float, pixels: int) -> Tensor:
-        edge = HELD * pixels / focal
+        edge = HELD_SLOPE_SHARE * pixels / focal
         held = slope.clamp(-principal / focal - edge, (pixels - principal) / focal + edge)
         half = focal / z * reach * (1 + held**2).sqrt() + more
         at = focal * slope + principal

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-SMALLEST = 1e-10
+MIN_SQUARED_ERROR = 1e-10
 """Mean squared error at which PSNR ends, at 100 dB: equal images have a PSNR that JSON can hold."""
 
 
@@ -18,4 +18,4 @@ def psnr(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
     """
     errors = (render.detach().clamp(0, 1).double() - photo.double()).square()
     error = errors.mean() if mask is None else errors[:, mask].mean()
-    return float(-10 * error.clamp_min(SMALLEST).log10())
+    return float(-10 * error.clamp_min(MIN_SQUARED_ERROR).log10())

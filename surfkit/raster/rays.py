@@ -12,7 +12,7 @@ from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import rotations
 
-PIECE = 1 << 22
+BATCH_POINT_SPLATS = 1 << 22
 """Pairs of a point and a splat that the reference evaluates at once."""
 
 
@@ -69,7 +69,7 @@ def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: T
     inside = ((z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)).nonzero()[:, 0]
     deep = (axes[:, 2] * splats.scales).square().sum(1) * CUTOFF**2
     there = (centre[:, 2] > near) & (deep < centre[:, 2] ** 2)
-    for rows in inside.split(max(1, PIECE // max(1, len(splats)))):
+    for rows in inside.split(max(1, BATCH_POINT_SPLATS // max(1, len(splats)))):
         ray = torch.stack(
             [(x[rows] - camera.cx) / camera.fx, (y[rows] - camera.cy) / camera.fy, torch.ones_like(z[rows])], 1
         )

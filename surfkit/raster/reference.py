@@ -14,25 +14,25 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, T_MIN, Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.footprints import Footprints, footprints
+from surfkit.raster.footprints import ProjectedSplats, footprints
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
-TILE = 16
+TILE_SIDE_PX = 16
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DifferentiableView:
     """A rendered view with its autograd graph; `near_threshold` (H, W) marks pixels where rounding may take another
     branch (an alpha within 1e-4 of ALPHA_MIN, a transmittance within 1e-4 of T_MIN or 0.5, relatively)."""
 
     maps: Maps
-    footprints: Footprints
+    footprints: ProjectedSplats
     seen: Tensor
     near_threshold: Tensor
 
 
-def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> Drawn:
+def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> DifferentiableView:
     """Draw splats with the autograd graph kept.
 
     Args:
@@ -54,17 +54,17 @@ def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> D
         seen[rows[touched]] = True
         near_threshold[y0:y1, x0:x1] = risky.view(y1 - y0, x1 - x0)
         blocks.append(block.view(10, y1 - y0, x1 - x0))
-    across = -(-camera.width // TILE)
+    across = -(-camera.width // TILE_SIDE_PX)
     channels = torch.cat([torch.cat(blocks[i : i + across], 2) for i in range(0, len(blocks), across)], 1)
     maps = Maps(channels[0:3], channels[3], channels[4], channels[5], channels[6:9], channels[9])
-    return Drawn(maps, prints, seen, near_threshold)
+    return DifferentiableView(maps, prints, seen, near_threshold)
 
 
 def _tiles(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
     """Left, upper, right and lower edge of each tile, row by row."""
-    for y0 in range(0, camera.height, TILE):
-        for x0 in range(0, camera.width, TILE):
-            yield x0, y0, min(x0 + TILE, camera.width), min(y0 + TILE, camera.height)
+    for y0 in range(0, camera.height, TILE_SIDE_PX):
+        for x0 in range(0, camera.width, TILE_SIDE_PX):
+            yield x0, y0, min(x0 + TILE_SIDE_PX, camera.width), min(y0 + TILE_SIDE_PX, camera.height)
 
 
 def _pixels(tile: tuple[int, int, int, int], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -74,7 +74,7 @@ def _pixels(tile: tuple[int, int, int, int], dtype: torch.dtype) -> tuple[Tensor
     return x.flatten().to(dtype), y.flatten().to(dtype)
 
 
-def _in_tile(prints: Footprints, tile: tuple[int, int, int, int], cull: bool) -> Tensor:
+def _in_tile(prints: ProjectedSplats, tile: tuple[int, int, int, int], cull: bool) -> Tensor:
     """Rows of the splats that may touch a tile, front to back; the order of float32 depths, in every precision."""
     keep = prints.drawn.clone()
     if cull:
@@ -85,7 +85,9 @@ def _in_tile(prints: Footprints, tile: tuple[int, int, int, int], cull: bool) ->
     return rows[prints.z.detach()[rows].float().argsort(stable=True)]
 
 
-def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor, shift: Tensor | None = None) -> tuple[Tensor, ...]:
+def _alphas(
+    prints: ProjectedSplats, rows: Tensor, x: Tensor, y: Tensor, shift: Tensor | None = None
+) -> tuple[Tensor, ...]:
     """What is blended, and where.
 
     Returns:
@@ -105,7 +107,7 @@ def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor, shift: Tenso
 
 
 def _blend(
-    prints: Footprints, rows: Tensor, x: Tensor, y: Tensor, shift: Tensor | None = None
+    prints: ProjectedSplats, rows: Tensor, x: Tensor, y: Tensor, shift: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The ten channels at P pixels, (10, P), the pixels near a threshold, (P,), and whether a row touches one, (n,)."""
     if not len(rows):
@@ -171,7 +173,7 @@ class Reference(Rasterizer):
         with torch.no_grad():
             prints = footprints(splats, camera, near)
             rows = prints.drawn.nonzero()[:, 0]
-            for some in inside.nonzero()[:, 0].split(TILE * TILE):
+            for some in inside.nonzero()[:, 0].split(TILE_SIDE_PX * TILE_SIDE_PX):
                 rho, depth, opacity = prints.at(rows, x[some], y[some], x.new_zeros(2))
                 alpha = (opacity * torch.exp(-rho / 2)).clamp_max(ALPHA_MAX)
                 found[some] = 1 - torch.where((alpha >= ALPHA_MIN) & (depth <= z[some]), 1 - alpha, 1.0).prod(0)

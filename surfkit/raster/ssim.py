@@ -10,7 +10,7 @@ from surfkit.raster import native
 from surfkit.raster.cuda import ssim as gpu
 
 C1, C2 = 0.01**2, 0.03**2
-RADIUS, SIGMA = 5, 1.5
+WINDOW_RADIUS_PX, WINDOW_SIGMA_PX = 5, 1.5
 
 
 def ssim(x: Tensor, y: Tensor) -> Tensor:
@@ -21,7 +21,7 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
         y: (C, H, W) in [0, 1]; a constant.
     """
     if native.module() is not None and x.device.type == "cpu" and x.dtype == torch.float32:
-        return _Fused.apply(x, y)
+        return _FusedSSIM.apply(x, y)
     if x.device.type == "cuda" and x.dtype == torch.float32:
         return _OnGpu.apply(x, y)
     return ssim_reference(x, y)
@@ -39,13 +39,13 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
         x: (C, H, W) in [0, 1].
         y: (C, H, W) in [0, 1].
     """
-    offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=x.dtype, device=x.device)
-    window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=x.dtype, device=x.device)
+    window = torch.exp(-(offsets**2) / (2 * WINDOW_SIGMA_PX**2))
     window = window / window.sum()
 
     def blur(image: Tensor) -> Tensor:
-        rows = conv2d(image[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
-        return conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
+        rows = conv2d(image[:, None], window.view(1, 1, 1, -1), padding=(0, WINDOW_RADIUS_PX))
+        return conv2d(rows, window.view(1, 1, -1, 1), padding=(WINDOW_RADIUS_PX, 0))[:, 0]
 
     mean_x, mean_y = blur(x), blur(y)
     squares = mean_x**2 + mean_y**2
@@ -54,7 +54,7 @@ def ssim_map(x: Tensor, y: Tensor) -> Tensor:
     return (2 * mean_x * mean_y + C1) * (2 * together + C2) / ((squares + C1) * (spread + C2))
 
 
-class _Fused(torch.autograd.Function):
+class _FusedSSIM(torch.autograd.Function):
     """Value and gradient in one native pass."""
 
     @staticmethod

@@ -7,7 +7,7 @@ import math
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, KINDS, Splats
+from surfkit.raster.api import GEOMETRIES, PRIMITIVE_KINDS, Splats
 
 
 def validate(splats: Splats, values: bool = True) -> None:
@@ -16,9 +16,10 @@ def validate(splats: Splats, values: bool = True) -> None:
     Raises:
         BadInput: Naming the tensor, the first wrong row and what is allowed.
     """
-    if splats.kind not in KINDS:
+    if splats.kind not in PRIMITIVE_KINDS:
         raise BadInput(
-            f"splats of kind {splats.kind!r}: the rasterizers draw {'s and '.join(KINDS)}s; the primitive needs a "
+            f"splats of kind {splats.kind!r}: the rasterizers draw {'s and '.join(PRIMITIVE_KINDS)}s; the primitive "
+            f"needs a "
             "`render` of its own, a `contribution` for blocks and trimming, and an `opacity_before` for mesh:tetra"
         )
     if splats.geometry not in GEOMETRIES or (splats.kind == "surfel" and splats.geometry != "axis"):

@@ -9,14 +9,14 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
-from surfkit.io.datasets.data import Reading
+from surfkit.io.datasets.data import ReadSettings
 from surfkit.runs.folder import Run
 
 
 def train_command(run: Run) -> str:
     """The `surfkit train` command that finishes a run, to be pasted; it names the recipe in the run folder."""
     words = [f"recipe:{run.out / 'recipe.json'}", "--data", str(run.data.path), "--out", str(run.out)]
-    for field in fields(Reading):
+    for field in fields(ReadSettings):
         value = getattr(run.data, field.name)
         if field.name != "test_every" and value != field.default:  # what is held out, the folder tells as well
             words += _words(field.name, value)

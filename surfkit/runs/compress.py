@@ -32,16 +32,16 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, View
 from surfkit.train.views import ViewContributions
 
-JUDGED = 24
+JUDGED_VIEWS = 24
 """Training views, evenly spaced, on which the loss is estimated while settings are chosen."""
-TRIES = 8
+MAX_TRIES = 8
 """Of settings, between the two ends below."""
-FINEST, COARSEST = 1 / 64, 32.0
+MIN_ERROR_FACTOR, MAX_ERROR_FACTOR = 1 / 64, 32.0
 """Errors that are tried, as factors of those of the compressor."""
 
 
 @dataclass(frozen=True)
-class Target:
+class CompressionTarget:
     """What a compressed model shall come to: one of the two, or neither.
 
     Attributes:
@@ -69,7 +69,7 @@ def make_wanted_compressed(ctx: RunContext, made: Reconstruction) -> None:
 
 
 def compress_run(
-    ctx: RunContext, made: Reconstruction, compressor: Compressor, target: Target | None = None
+    ctx: RunContext, made: Reconstruction, compressor: Compressor, target: CompressionTarget | None = None
 ) -> dict[str, Any]:
     """Compress the model of a run into its folder, and return what compressed.json says.
 
@@ -81,7 +81,7 @@ def compress_run(
     run.compressed.mkdir(exist_ok=True)
     write = writing(model, importance, ctx.scene.frame, run.recipe.seed, ctx.rasterizer.where())
     if target is not None and target.is_set:
-        judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
+        judge = None if target.decibels is None else PsnrDrop(model, ctx.scene.train, ctx.rasterizer)
         compressor = fitted(compressor, target, write, judge)
     size = write(run.compressed_model, compressor)
     forget_compressed(run)  # only now: what cannot be compressed so costs nothing of before
@@ -183,11 +183,11 @@ def on_cpu(model: SplatModel) -> SplatModel:
     return replace(model, params={name: value.detach().cpu().contiguous() for name, value in model.params.items()})
 
 
-class Judge:
+class PsnrDrop:
     """Tells how much of the PSNR of a model on training views another one loses."""
 
     def __init__(self, model: SplatModel, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        step = max(1, -(-len(views) // JUDGED))
+        step = max(1, -(-len(views) // JUDGED_VIEWS))
         self.views, self.draws, self.near = views[::step], drawn_by(model.primitive, rasterizer), model.near
         self.photos: list[Tensor] = []
         self.renders: list[Tensor] = []
@@ -216,7 +216,10 @@ class Judge:
 
 
 def fitted(
-    compressor: Compressor, target: Target, write: Callable[[Path, Compressor], int], judge: Judge | None = None
+    compressor: Compressor,
+    target: CompressionTarget,
+    write: Callable[[Path, Compressor], int],
+    judge: PsnrDrop | None = None,
 ) -> Compressor:
     """The compressor with errors as large as the target allows, or as small; bisected on the scale of all errors.
 
@@ -236,20 +239,22 @@ def fitted(
         path = Path(folder) / "tried.surfkit"
         size = write(path, tried)
         done[0] += 1
-        emit(Progress("choosing settings", done[0], TRIES + 2))
+        emit(Progress("choosing settings", done[0], MAX_TRIES + 2))
         if target.bytes is not None:
             return size <= target.bytes
         return judge.loss(ModelFile(path).read()[0]) <= target.decibels
 
     done = [0]
     with TemporaryDirectory() as folder:
-        good, bad = (COARSEST, FINEST) if target.bytes is not None else (FINEST, COARSEST)
+        good, bad = (
+            (MAX_ERROR_FACTOR, MIN_ERROR_FACTOR) if target.bytes is not None else (MIN_ERROR_FACTOR, MAX_ERROR_FACTOR)
+        )
         if fits(bad):
             return compressor.coarser(bad)
         if not fits(good):
             what = f"{target.bytes:,} bytes" if target.bytes is not None else f"{target.decibels:g} dB"
             raise BadInput(f"compress:{name_of(compressor)} does not come to {what} with any setting; allow more")
-        for _ in range(TRIES):
+        for _ in range(MAX_TRIES):
             middle = math.sqrt(good * bad)
             good, bad = (middle, bad) if fits(middle) else (good, middle)
     return compressor.coarser(good)

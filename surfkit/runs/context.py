@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from surfkit.raster.api import Rasterizer
 from surfkit.runs.folder import Run
-from surfkit.runs.shared import Shares
+from surfkit.runs.shared import RunCache
 from surfkit.runs.stage import Intervals
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import CacheSettings
@@ -30,7 +30,7 @@ class RunContext:
     rasterizer: Rasterizer
     intervals: Intervals
     caches: CacheSettings
-    shares: Shares | None = None
+    shares: RunCache | None = None
 
     def keep(self, part: str) -> None:
         """Put a finished part of the run where others find it, if the run shares any."""

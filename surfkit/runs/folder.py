@@ -24,10 +24,21 @@ from surfkit.train.stage import Stage
 
 SHARED = "shared.json"
 """What a run shares with others, see `surfkit.runs.shared`."""
-FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
+RUN_FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
 """In a run folder."""
-FOLDERS = ("pretrain", "partition", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
-MESHES = ("mesh.ply", "mesh.obj", "mesh.glb")
+RUN_FOLDERS = (
+    "pretrain",
+    "partition",
+    "tune",
+    "blocks",
+    "pictures",
+    "progress",
+    "method",
+    "result",
+    "lod",
+    "compressed",
+)
+MESH_FILES = ("mesh.ply", "mesh.obj", "mesh.glb")
 """Files of meshes in a run folder; others begin with `mesh-lod`."""
 
 
@@ -247,10 +258,10 @@ def refuse_file(out: Path) -> None:
     """BadInput if a file is in the place of a run folder, or a folder in the place of one of its files."""
     if out.exists() and not out.is_dir():
         raise BadInput(f"--out {out}: a file, not a folder; name another one")
-    for name in FILES:
+    for name in RUN_FILES:
         if (out / name).is_dir():
             raise BadInput(f"{out / name}: a folder, where the run keeps a file; delete it")
-    for path in [*(out / name for name in FOLDERS), *out.glob("refine[0-9]")]:
+    for path in [*(out / name for name in RUN_FOLDERS), *out.glob("refine[0-9]")]:
         if path.is_file():
             raise BadInput(f"{path}: a file, where the run keeps a folder; delete it")
     refuse_links(out)
@@ -260,7 +271,7 @@ def refuse_foreign(out: Path) -> None:
     """BadInput if a folder that holds no run has files of the names that a run would give to its own."""
     if (out / "run.json").exists():  # the first that a run writes
         return
-    names = (*FILES, "cameras.json", "mesh.json", *MESHES)
+    names = (*RUN_FILES, "cameras.json", "mesh.json", *MESH_FILES)
     if foreign := [name for name in names if (out / name).exists()]:
         raise BadInput(
             f"--out {out}: no run folder (no run.json in it), but it has {few(foreign)}, which would be replaced; name "
@@ -274,7 +285,7 @@ def refuse_links(out: Path) -> None:
     Of files, only those count that are written to in place; for others, a new file takes the place of a link.
     """
     for path in _links(out):
-        in_place = path.is_dir() or path.name in (journal.NAME, LOG) or path.is_relative_to(out / "method")
+        in_place = path.is_dir() or path.name in (journal.JOURNAL_FILE, LOG) or path.is_relative_to(out / "method")
         if in_place and not path.resolve().is_relative_to(out.resolve()):
             raise BadInput(
                 f"{path}: a link out of the run folder, to {path.resolve()}, where nothing is written or deleted; "
@@ -345,4 +356,4 @@ def discard_results(run: Run, stage: RunStage) -> None:
     names = [one.name for one in run.stages]
     for later in run.stages[names.index(stage.name) + 1 :]:
         checkpoint.discard(later.checkpoint)
-        (later.folder / journal.NAME).unlink(missing_ok=True)
+        (later.folder / journal.JOURNAL_FILE).unlink(missing_ok=True)

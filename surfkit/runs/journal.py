@@ -18,10 +18,10 @@ from surfkit.core.files import replacing
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 
-NAME = "events.jsonl"
-COUNTED = {"StepDone", "PointsEdited", "Measured"}
+JOURNAL_FILE = "events.jsonl"
+STEP_EVENTS = {"StepDone", "PointsEdited", "Measured"}
 """Events that have the index of their step."""
-ALWAYS = {"event": str, "time": (int, float)}
+REQUIRED_FIELDS = {"event": str, "time": (int, float)}
 """What every line has."""
 
 
@@ -33,7 +33,7 @@ class Journal:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.path = folder / NAME
+        self.path = folder / JOURNAL_FILE
         self.file: int | None = None
 
     @hookimpl
@@ -95,7 +95,7 @@ def remove_steps(path: Path, first: int) -> None:
     """Remove the events of step `first` and of all later ones, and incomplete lines."""
     if not path.exists():
         return
-    stays = [text for text, line in _lines(path) if line["event"] not in COUNTED or line.get("index", 0) < first]
+    stays = [text for text, line in _lines(path) if line["event"] not in STEP_EVENTS or line.get("index", 0) < first]
     text = "".join(stays).encode()
     if len(text) != path.stat().st_size:
         with replacing(path) as file:
@@ -119,6 +119,8 @@ def _parsed(journal: str) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _is_valid(line: Any) -> bool:
-    if not isinstance(line, dict) or not all(isinstance(line.get(name), kind) for name, kind in ALWAYS.items()):
+    if not isinstance(line, dict) or not all(
+        isinstance(line.get(name), kind) for name, kind in REQUIRED_FIELDS.items()
+    ):
         return False
-    return line["event"] not in COUNTED or isinstance(line.get("index"), int)
+    return line["event"] not in STEP_EVENTS or isinstance(line.get("index"), int)

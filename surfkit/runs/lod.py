@@ -40,9 +40,9 @@ from surfkit.scene.scene import Scene, View
 
 BLOCKS = "blocks.safetensors"
 """In the folder of the levels: the tree, and the order of the points of the model."""
-UNFINISHED = "unfinished-"
+UNFINISHED_PREFIX = "unfinished-"
 """How folders begin in which a component keeps what it has made so far."""
-AHEAD = 8
+PHOTOS_AHEAD = 8
 """Photographs in memory while levels are measured."""
 
 
@@ -76,8 +76,8 @@ def make_levels(
     """
     began, model = time.perf_counter(), splats_of(run, made)
     lod.refuse_unfit(model.primitive)
-    folder = run.lod / f"{UNFINISHED}{_digest(run, lod, model)}"
-    for left in run.lod.glob(f"{UNFINISHED}*"):
+    folder = run.lod / f"{UNFINISHED_PREFIX}{_digest(run, lod, model)}"
+    for left in run.lod.glob(f"{UNFINISHED_PREFIX}*"):
         if left != folder:
             shutil.rmtree(left)
     folder.mkdir(parents=True, exist_ok=True)
@@ -220,6 +220,6 @@ def _measure(scene: Scene, draw: Draw) -> dict[str, Any]:
     views = scene.held_out
     if not views:
         return {"psnr": None, "ssim": None, "fps": frames_per_second(scene.train, draw)}
-    ahead = AHEAD * max(3 * view.camera.width * view.camera.height for view in views)
+    ahead = PHOTOS_AHEAD * max(3 * view.camera.width * view.camera.height for view in views)
     found = evaluate_views(views, photo_cache(views, ahead), draw, masks=mask_cache(views, ahead))
     return {"psnr": found["images"]["psnr"], "ssim": found["images"]["ssim"], "fps": found["fps"]}

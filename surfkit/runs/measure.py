@@ -23,7 +23,7 @@ from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
 from surfkit.train.memory_meter import MemoryMeter
 
-AHEAD = 8
+PHOTOS_AHEAD = 8
 """Photographs in memory while held-out ones are measured: each is needed once."""
 
 
@@ -48,7 +48,7 @@ def evaluate(
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides and made.draw else ((), None)
     colors = made.draw_color or made.draw
-    ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
+    ahead = PHOTOS_AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(run.pictures, view.name), panel(photo, maps))
@@ -103,7 +103,7 @@ def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
     """
     if not scene.held_out:
         return
-    ahead = AHEAD * max(3 * view.camera.width * view.camera.height for view in scene.held_out)
+    ahead = PHOTOS_AHEAD * max(3 * view.camera.width * view.camera.height for view in scene.held_out)
     found = evaluate_views(
         scene.held_out,
         photo_cache(scene.held_out, ahead),

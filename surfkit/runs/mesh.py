@@ -20,7 +20,7 @@ from surfkit.evaluate.images.pictures import write_picture
 from surfkit.io.datasets.depth_prior import read_priors
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
-from surfkit.mesh.clean import Report, clean
+from surfkit.mesh.clean import CleaningReport, clean
 from surfkit.mesh.closed import closed, require_closed
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import forget_spooled
@@ -30,7 +30,7 @@ from surfkit.mesh.simplify import require_kernels, simplified
 from surfkit.mesh.stereo import points
 from surfkit.mesh.values import by_value, ends_of, words_of
 from surfkit.primitives.drawing import drawn_by
-from surfkit.primitives.model import NEAR
+from surfkit.primitives.model import DEFAULT_NEAR
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.runs.folder import Run
 from surfkit.runs.methods.base import Reconstruction
@@ -40,9 +40,9 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.scene.up_direction import up_direction, up_of_views
 
-SHOWN = 4
+PICTURE_VIEWS = 4
 """Training views that pictures are made of."""
-LONGEST = 800
+PICTURE_SIDE_PX = 800
 """Side of a picture, pixels."""
 SUFFIXES = (".ply", ".obj", ".mtl", ".glb", ".json")
 """Of files that belong to a mesh."""
@@ -145,7 +145,7 @@ def mesh_input(
         views=scene.train,
         draw=draw,
         rasterizer=drawn_by(made.splats.primitive, rasterizer) if made.splats else rasterizer,
-        near=made.splats.near if made.splats else NEAR,
+        near=made.splats.near if made.splats else DEFAULT_NEAR,
         frame=scene.frame,
         budget_bytes=budget_bytes,
         generator=torch.Generator().manual_seed(run.recipe.seed),
@@ -302,7 +302,7 @@ def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Me
     return meshes
 
 
-def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
+def describe(report: CleaningReport, subject: MeshInput) -> dict[str, Any]:
     """The report with lengths in units of the data set."""
     return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
 
@@ -358,22 +358,22 @@ def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> dict[str, str]:
     """Write pictures of the mesh: from above, also coloured by each of its values, and beside the renders of a few
     training views. What the colours mean, by the name of the picture.
     """
-    count = min(SHOWN, len(subject.views))
+    count = min(PICTURE_VIEWS, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
     path, up = run.mesh_pictures / "above.png", up_of(mesh, cameras)
-    write_picture(path, from_above(mesh, up, LONGEST))
+    write_picture(path, from_above(mesh, up, PICTURE_SIDE_PX))
     emit(FileWritten(path, "picture"))
     told = {}
     for name, values in mesh.values.items():
         path, ends = run.mesh_pictures / f"above-{name}.png", ends_of(name, values)
-        write_picture(path, from_above(mesh, up, LONGEST, by_value(name, values, ends)))
+        write_picture(path, from_above(mesh, up, PICTURE_SIDE_PX, by_value(name, values, ends)))
         if name in LENGTHS:
             ends = ends[0] / subject.frame.scale, ends[1] / subject.frame.scale
         told[path.name] = words_of(name, ends, unit_of(subject.frame))
         emit(FileWritten(path, f"picture, {told[path.name]}"))
     for at, view in enumerate(views):
-        camera = view.camera.fitted(LONGEST)
+        camera = view.camera.fitted(PICTURE_SIDE_PX)
         color = subject.draw(view).color.clamp(0, 1)
         if camera != view.camera:
             size = (camera.height, camera.width)

@@ -43,12 +43,12 @@ from surfkit.train.state import StageState
 
 RESULT = Path("result", "result.json")
 """In the folder of a run, what its method has made; arrays lie beside it."""
-SHARE = 8
+BUDGET_PARTS = 8
 """Photographs, masks and depth priors take at most one part each of so many parts of the memory."""
 
 
 @dataclass(frozen=True)
-class Kept:
+class ReconstructionRecord:
     """What the run keeps of a reconstruction, as result/result.json has it; arrays lie beside it.
 
     Attributes:
@@ -73,7 +73,7 @@ class Kept:
     peak_gpu_bytes: int = 0
 
 
-class Pictures:
+class LazyPhotos:
     """Photographs and masks of training views, read when the first of them is asked for."""
 
     def __init__(self, scene: Scene, budget_bytes: int) -> None:
@@ -111,10 +111,10 @@ def method_input(
     """Within, there is what the method of a run works with."""
     run, scene, budget = ctx.run, ctx.scene, ctx.caches.bytes()
     method = run.recipe.method
-    pictures = Pictures(scene, budget // SHARE)
+    pictures = LazyPhotos(scene, budget // BUDGET_PARTS)
     priors = None
     if method.needs_prior:
-        priors = read_priors(run.data, scene, budget // SHARE, normals=method.needs_normals)
+        priors = read_priors(run.data, scene, budget // BUDGET_PARTS, normals=method.needs_normals)
     try:
         yield MethodInput(
             scene=replace(scene, held_out=()),
@@ -171,7 +171,7 @@ def reconstruct(run: Run, given: MethodInput) -> Reconstruction:
 
 def reopened(run: Run, given: MethodInput) -> Reconstruction:
     """The finished reconstruction of a run; a method that draws by itself is asked again when a view is to be drawn."""
-    folder, kept = run.out / "result", read_json(result_path(run), Kept)
+    folder, kept = run.out / "result", read_json(result_path(run), ReconstructionRecord)
     mesh = splats = None
     try:
         if kept.mesh is not None:
@@ -228,7 +228,7 @@ def keep(run: Run, made: Reconstruction) -> None:
             file.write(safetensors.save(params))
     write_json(
         result_path(run),
-        Kept(
+        ReconstructionRecord(
             facts=dump(dict(made.facts)),
             steps=made.steps,
             seconds=made.seconds or 0.0,
@@ -325,7 +325,7 @@ def refuse_not_drawn(run: Run) -> None:
 def is_drawn(run: Run) -> bool:
     """Whether what a run has made can draw pictures; so is what is not made yet."""
     path = result_path(run)
-    kept = read_json(path, Kept) if path.exists() else None
+    kept = read_json(path, ReconstructionRecord) if path.exists() else None
     return kept is None or kept.primitive is not None or kept.draws
 
 
@@ -342,7 +342,7 @@ def not_drawn(run: Run) -> dict[str, Any]:
 def refuse_mesher(out: Path) -> None:
     """BadInput if the mesh of the run in a folder was made by its method, so that a mesher has nothing to do."""
     path = out / RESULT
-    if path.exists() and read_json(path, Kept).mesh is not None:
+    if path.exists() and read_json(path, ReconstructionRecord).mesh is not None:
         raise BadInput(f"{out}: the method of the run made its mesh; leave out mesh:NAME and --mesh.*")
 
 

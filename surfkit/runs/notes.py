@@ -18,7 +18,7 @@ NOTES = "notes of the run"
 """Name of the plugin."""
 
 
-class Notes:
+class RunNotes:
     """Prints the warnings of a run; keeps them, the names of skipped photographs and the memory in run.json."""
 
     def __init__(self) -> None:
@@ -77,9 +77,9 @@ def higher(known: Mapping[str, int], found: Mapping[str, int]) -> dict[str, int]
 
 
 @contextmanager
-def collect_notes() -> Iterator[Notes]:
+def collect_notes() -> Iterator[RunNotes]:
     """Within, warnings are printed and collected."""
-    notes = Notes()
+    notes = RunNotes()
     plugins().register(notes, NOTES)
     try:
         yield notes
@@ -104,7 +104,7 @@ def repeat_warnings(out: Path, folder: Path, prefix: str) -> None:
     """Emit for the run in `out` the warnings in the journal of a part of it, which another process has written."""
     record = read_record(out)
     notes, skipped = set(record.get("notes", [])), set(record.get("skipped", []))
-    for line in journal.read(folder / journal.NAME):
+    for line in journal.read(folder / journal.JOURNAL_FILE):
         text, name = line.get("text"), line.get("name")
         if line["event"] == "Warned" and isinstance(text, str) and not {text, prefix + text} & notes:
             notes.add(text)

@@ -55,10 +55,10 @@ from surfkit.runs.prepare import with_maps, with_maps_to_mesh
 from surfkit.runs.recipe import Recipe, complete, refuse_unused
 from surfkit.runs.refine import refine_model, stage_scene
 from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
-from surfkit.runs.shared import Shares
+from surfkit.runs.shared import RunCache
 from surfkit.runs.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
-from surfkit.runs.start import InitialPoints, align_priors
-from surfkit.runs.store import StageStore
+from surfkit.runs.start import InitialPointBuilder, align_priors
+from surfkit.runs.store import StageCache
 from surfkit.runs.warn import warn_of_gaps, warn_of_no_edits
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
@@ -66,14 +66,14 @@ from surfkit.train.bars import bars
 from surfkit.train.data_cache import CacheSettings, read_ahead
 from surfkit.train.faults import in_one_line
 from surfkit.train.memory_meter import MemoryMeter
-from surfkit.train.stage import MOST_STEPS
+from surfkit.train.stage import MAX_STAGE_STEPS
 from surfkit.train.state import StageState
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
     """The recipe as a run of `steps` steps, every schedule scaled along."""
-    if not 1 <= steps <= MOST_STEPS:
-        raise BadInput(f"--steps {steps}: give 1 to {MOST_STEPS}")
+    if not 1 <= steps <= MAX_STAGE_STEPS:
+        raise BadInput(f"--steps {steps}: give 1 to {MAX_STAGE_STEPS}")
     if recipe.has_stages:
         return rescale(recipe, steps / recipe.pretrain.steps)
     name = f"method:{name_of(recipe.method)}"
@@ -92,7 +92,7 @@ def run(
     compute: Compute | None = None,
     intervals: Intervals | None = None,
     caches: CacheSettings | None = None,
-    store: StageStore | None = None,
+    store: StageCache | None = None,
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
 
@@ -140,9 +140,9 @@ def run(
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
-        shares = Shares.of(run, store, backend, prints)
+        shares = RunCache.of(run, store, backend, prints)
         ctx = RunContext(run, scene, rasterizer, intervals, caches, shares)
-        stages = Stages(ctx, compute, meter, state)
+        stages = RecipeStages(ctx, compute, meter, state)
         given = use.enter_context(method_input(ctx, compute.device, stages))
         recipe.method.refuse_unfit(given)
         known = len(notes.texts)
@@ -157,7 +157,7 @@ def run(
             return results(ctx, made, compute.device, meter)
 
 
-class Stages:
+class RecipeStages:
     """The stages of a recipe, to be optimised one after the other.
 
     Args:
@@ -169,7 +169,7 @@ class Stages:
 
     def __init__(self, ctx: RunContext, compute: Compute, meter: MemoryMeter, state: StageState | None) -> None:
         self.ctx, self.compute, self.meter, self.state = ctx, compute, meter, state
-        self.start: InitialPoints | None = None
+        self.start: InitialPointBuilder | None = None
 
     def begin(self) -> None:
         """Find where the first stage begins, or BadInput; nothing is written."""
@@ -245,14 +245,18 @@ def refuse_unplannable(run: Run, scene: Scene) -> None:
         )
 
 
-def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
+def initial_points(
+    run: Run, scene: Scene, caches: CacheSettings, state: StageState | None
+) -> InitialPointBuilder | None:
     """The initial points of pretraining and its photographs, also if it is resumed; None if it has all its steps."""
     if state is not None and state.index >= run.recipe.pretrain.steps:
         return None
     if state is None:
         run.recipe.start.refuse_unfit(run.recipe.primitive, scene)
     known = align_priors(run, scene, begun=state is not None)
-    return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
+    return InitialPointBuilder(
+        run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known
+    )
 
 
 def results(ctx: RunContext, made: Reconstruction, device: Device, meter: MemoryMeter) -> dict[str, Any]:

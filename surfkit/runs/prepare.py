@@ -14,8 +14,8 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
-from surfkit.depth.prepare import REMEDY, WITHOUT_DEPTH, Preparation, others_warning
-from surfkit.io.datasets.depth_files import FOLDER, DepthFile
+from surfkit.depth.prepare import REMEDY, WITHOUT_DEPTH, DepthPreparation, others_warning
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DepthFile
 from surfkit.io.datasets.depth_prior import prior_files
 from surfkit.io.datasets.fingerprint import Fingerprint, fingerprint
 from surfkit.io.datasets.made_maps import is_there, located
@@ -106,7 +106,7 @@ def made_maps(
     run: Run, scene: Scene, prints: Fingerprint, caches: CacheSettings, device: Device
 ) -> Iterator[Path | None]:
     """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any."""
-    preparation = Preparation(run.data, run.recipe.depth, torch_device(device))
+    preparation = DepthPreparation(run.data, run.recipe.depth, torch_device(device))
     tracks = observations(run.data, scene)
     try:
         preparation.refuse_unfit(scene, tracks)
@@ -116,7 +116,7 @@ def made_maps(
         return
     if notice := run.recipe.depth.notice():
         emit(Warned(notice))
-    if (folder := run.data.path / FOLDER).is_dir():
+    if (folder := run.data.path / DEPTH_FOLDER).is_dir():
         emit(Warned(f"{folder} has no map of these photographs, so others are made"))
     key = key_of(run.recipe.depth, scene, prints, tracks, preparation.device)
     with maps(preparation, scene, tracks, key, caches.maps_bytes()) as (folder, made):

@@ -24,7 +24,7 @@ from surfkit.io.datasets.fingerprint import Fingerprint, changed, changed_file, 
 from surfkit.io.datasets.made_maps import is_there, located, read_made
 from surfkit.io.datasets.read import read
 from surfkit.runs.folder import Run, read_data, read_record
-from surfkit.runs.notes import Notes
+from surfkit.runs.notes import RunNotes
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.scene import Frame, Scene
 
@@ -220,7 +220,7 @@ def _difference(run: Run, scene: Scene, before: Fingerprint, now: Fingerprint, s
 
 
 @dataclass(frozen=True)
-class Place:
+class FrameRecord:
     """Where the local frame of a run lies, as run.json has it; see `Frame`."""
 
     origin: tuple[float, float, float]
@@ -232,7 +232,7 @@ def _moved(run: Run, frame: Frame) -> str | None:
     known = read_record(run.out).get("frame")
     if not isinstance(known, dict):  # older runs
         return None
-    place = load(Place, {name: known.get(name) for name in ("origin", "scale")}, f"{run.record}: frame")
+    place = load(FrameRecord, {name: known.get(name) for name in ("origin", "scale")}, f"{run.record}: frame")
     moved = float(np.abs(np.subtract(place.origin, frame.origin)).max()) * frame.scale
     if moved <= SAME_PLACE and abs(place.scale / frame.scale - 1) <= SAME_PLACE:
         return None
@@ -242,7 +242,7 @@ def _moved(run: Run, frame: Frame) -> str | None:
     return f"the reconstruction has other coordinates: the middle of its cameras was {then} and is {here}{grown}"
 
 
-def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
+def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: RunNotes, frame: Frame) -> None:
     """Write run.json, inputs.json and recipe.json; the recipe last, as it makes the folder a run."""
     before = read_record(run.out)
     notes.begin(

@@ -16,16 +16,16 @@ from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import MemoryTaken, emit, say
 from surfkit.core.registry import BUILTIN, plugins, records
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.fingerprint import Fingerprint, Stamp
+from surfkit.io.datasets.fingerprint import FileStamp, Fingerprint
 from surfkit.runs import journal
 from surfkit.runs.execute.state import read_state
 from surfkit.runs.folder import SHARED, Run
 from surfkit.runs.notes import prefix_notes, repeat_warnings
 from surfkit.runs.recipe import Recipe, complete
-from surfkit.runs.store import Entry, StageStore
+from surfkit.runs.store import CachedStage, StageCache
 from surfkit.train.data_cache import needs_priors
 
-FILES = {
+PART_FILE_PATTERNS = {
     "pretrain": ("events.jsonl", "pretrain/checkpoint.safetensors"),
     "plan": ("blocks/plan.png", "blocks/plan.json"),
     "tune": (
@@ -44,16 +44,16 @@ FILES = {
 blocks are not among them, as the merged model holds all that later parts need."""
 
 
-SOURCES = (".py", ".cu", ".cpp", ".h", ".so")
+CODE_SUFFIXES = (".py", ".cu", ".cpp", ".h", ".so")
 """Endings of files with code of a plugin."""
-PLAN, TUNE = ("partition", "assign", "min_views", "partition_pretrain"), ("tune", "context")
+PLAN_FIELDS, TUNE_FIELDS = ("partition", "assign", "min_views", "partition_pretrain"), ("tune", "context")
 """Fields of the recipe that belong to the plan of the blocks, and to tuning them."""
-OTHERS = ("about", "test_every", "depth", "refine", "mesh", "lod", "compress")
+OTHER_FIELDS = ("about", "test_every", "depth", "refine", "mesh", "lod", "compress")
 """Fields with parts of their own, and those that count only where depth maps are looked at, or never."""
 
 
 @dataclass(frozen=True)
-class Part:
+class SharedPart:
     """One part of what a run makes.
 
     Attributes:
@@ -70,33 +70,33 @@ class Part:
     needs_prior: bool = False
 
 
-def parts(recipe: Recipe) -> Iterator[Part]:
+def parts(recipe: Recipe) -> Iterator[SharedPart]:
     """Every part of what a recipe makes, in its order; each one comes after those that it depends on.
 
     A field of the recipe that no other part has belongs to the first one.
     """
     recipe = load(Recipe, dump(complete(recipe)))  # numbers as they come from a file: 8 and 8.0 are the same
-    first = [each.name for each in fields(recipe) if each.name not in (*PLAN, *TUNE, *OTHERS)]
+    first = [each.name for each in fields(recipe) if each.name not in (*PLAN_FIELDS, *TUNE_FIELDS, *OTHER_FIELDS)]
     if recipe.has_stages:
         last, needs_prior = "pretrain", recipe.start.needs_prior or needs_priors(recipe.pretrain.losses)
     else:
         last, needs_prior = "result", recipe.method.needs_prior
         first += [name for name in recipe.method.uses if name not in first]
-    yield Part(last, None, _settings(recipe, first), needs_prior)
+    yield SharedPart(last, None, _settings(recipe, first), needs_prior)
     if recipe.has_stages and recipe.partition is not None:
         other = recipe.partition_pretrain
-        yield Part("plan", last, _settings(recipe, PLAN), other is not None and needs_priors(other.losses))
+        yield SharedPart("plan", last, _settings(recipe, PLAN_FIELDS), other is not None and needs_priors(other.losses))
         last = "tune"
-        yield Part(last, "plan", _settings(recipe, TUNE), needs_priors(recipe.tune.losses))
+        yield SharedPart(last, "plan", _settings(recipe, TUNE_FIELDS), needs_priors(recipe.tune.losses))
     for at, refine in enumerate(recipe.refine):
         needs_prior = needs_priors(refine.stage.losses) or any(mesher.needs_prior for mesher in refine.meshers)
-        yield Part(f"refine{at}", last, dump(refine), needs_prior)
+        yield SharedPart(f"refine{at}", last, dump(refine), needs_prior)
         last = f"refine{at}"
     if recipe.mesh is not None:
-        yield Part("mesh", last, dump(recipe.mesh), recipe.mesh.needs_prior)
+        yield SharedPart("mesh", last, dump(recipe.mesh), recipe.mesh.needs_prior)
     for name in ("lod", "compress"):
         if (wanted := getattr(recipe, name)) is not None:
-            yield Part(name, last, dump(wanted))
+            yield SharedPart(name, last, dump(wanted))
 
 
 def _settings(recipe: Recipe, names: Sequence[str]) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def _source_tag(name: str) -> str:
         return ""
     file = Path(module.__file__)
     is_alone = not getattr(module, "__package__", None)
-    paths = [file] if is_alone else sorted(each for each in file.parent.rglob("*") if each.suffix in SOURCES)
+    paths = [file] if is_alone else sorted(each for each in file.parent.rglob("*") if each.suffix in CODE_SUFFIXES)
     found = hashlib.sha256()
     for path in paths:
         found.update(f"\0{path.relative_to(file.parent).as_posix()}\0".encode() + path.read_bytes())
@@ -191,12 +191,12 @@ def inputs_of(run: Run, backend: str, prints: Fingerprint) -> Callable[[bool], A
     return inputs
 
 
-def _content(stamp: Stamp) -> list[Any]:
+def _content(stamp: FileStamp) -> list[Any]:
     return [stamp.size, stamp.content, stamp.meaning]
 
 
 @dataclass(frozen=True)
-class Shares:
+class RunCache:
     """The parts of one run in a store.
 
     Attributes:
@@ -207,12 +207,12 @@ class Shares:
     """
 
     run: Run
-    store: StageStore | None = None
+    store: StageCache | None = None
     keys: dict[str, str] = field(default_factory=dict)
-    found: dict[str, Entry] = field(default_factory=dict)
+    found: dict[str, CachedStage] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, run: Run, store: StageStore | None, backend: str, prints: Fingerprint) -> Shares:
+    def of(cls, run: Run, store: StageCache | None, backend: str, prints: Fingerprint) -> RunCache:
         """Look for the parts of a run in a store; nothing is written."""
         if store is None:
             return cls(run)
@@ -262,7 +262,7 @@ def read_shared(out: Path) -> dict[str, dict[str, Any]]:
 def repeat(out: Path, folder: Path, prefix: str) -> None:
     """Emit for the run in `out` the warnings and the memory in the journal of a part of it that was taken."""
     with prefix_notes(prefix):
-        for line in journal.read(folder / journal.NAME):
+        for line in journal.read(folder / journal.JOURNAL_FILE):
             if line["event"] == "MemoryTaken":
                 emit(MemoryTaken(line["parts"], line.get("gpu") or {}))
     repeat_warnings(out, folder, prefix)
@@ -270,7 +270,7 @@ def repeat(out: Path, folder: Path, prefix: str) -> None:
 
 def _patterns(name: str) -> list[str]:
     kind = "refine" if name.startswith("refine") else name
-    return [pattern.format(name=name) for pattern in FILES[kind]]
+    return [pattern.format(name=name) for pattern in PART_FILE_PATTERNS[kind]]
 
 
 def _files(out: Path, name: str) -> list[str]:

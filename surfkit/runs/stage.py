@@ -27,11 +27,11 @@ from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import TrainingData
-from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
+from surfkit.train.faults import MAX_RATE_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.in_view import with_frozen
 from surfkit.train.interrupt import graceful
 from surfkit.train.memory_meter import MemoryMeter
-from surfkit.train.progress import Display
+from surfkit.train.progress import TrainingDisplay
 from surfkit.train.retry_on_oom import lowered
 from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer
@@ -40,7 +40,7 @@ from surfkit.train.watch import Stopwatch, Watched, watched
 CHECKPOINT_EVERY = 500
 WATCH_EVERY = 10
 """Steps between two checks of the free memory."""
-LEAST_FREE = 256 << 20
+MIN_FREE_MEMORY_BYTES = 256 << 20
 """Bytes of free memory; with less, the caches are made smaller before the system kills the process."""
 
 
@@ -205,13 +205,13 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     clock, draw = Stopwatch(state), live_drawing(job, trainer, state)
     with (
         graceful() as request,
-        Display(at.title, steps) as display,
+        TrainingDisplay(at.title, steps) as display,
         watched(Watched(at.title, at.journal, job.scene, draw, lambda: request.asked)) as look,
     ):
         for done in trainer.run(state, clock):
             display.show(done)
             meter.step(state, job.given, trainer.uploads)
-            if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
+            if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < MIN_FREE_MEMORY_BYTES:
                 lower_caches(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
             if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
@@ -272,14 +272,14 @@ def return_to_checkpoint(
     Raises:
         NotFinite: They have been halved often enough.
     """
-    if halvings >= MOST_HALVINGS:
+    if halvings >= MAX_RATE_HALVINGS:
         raise NotFinite(
             f"{stage.out}: {error}, also after the learning rates were halved {halvings} times; look at that "
             f"photograph and its camera, or lower {stage.setting}.rates in another folder; the last checkpoint is whole"
         ) from error
     state = last_state(stage, fresh)
     state.halvings = halvings + 1
-    times = f"{state.halvings} of {MOST_HALVINGS} times"
+    times = f"{state.halvings} of {MAX_RATE_HALVINGS} times"
     emit(Warned(f"{error}; back to step {state.index}, with learning rates halved ({times})"))
     checkpoint.save(stage.checkpoint, state)
     return state

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.depth_prior import Alignment, alignment, prior_bytes, prior_files, read_priors
+from surfkit.io.datasets.depth_prior import DepthAlignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
 from surfkit.runs.folder import Run
@@ -16,12 +16,12 @@ from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel, StartInput
 from surfkit.train.data_cache import TrainingData, needs_normals, needs_priors, scale_band
 
-AHEAD = 4
+PRIORS_AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""
 
 
 @dataclass(frozen=True)
-class InitialPoints:
+class InitialPointBuilder:
     """Makes the initial points of a run.
 
     Attributes:
@@ -34,7 +34,7 @@ class InitialPoints:
     run: Run
     scene: Scene
     given: TrainingData
-    known: Alignment | None
+    known: DepthAlignment | None
 
     def __call__(self, generator: torch.Generator) -> InitialModel:
         """The points; the generator is that of the stage."""
@@ -42,7 +42,9 @@ class InitialPoints:
         priors = None
         if start.needs_prior:
             largest = max(view.camera.width * view.camera.height for view in scene.train)
-            priors = read_priors(self.run.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
+            priors = read_priors(
+                self.run.data, scene, PRIORS_AHEAD * prior_bytes(True) * largest, self.known, normals=True
+            )
         own = torch.Generator().manual_seed(self.run.recipe.seed)
         try:
             known = StartInput(scene, given.photos, given.masks, priors, own)
@@ -52,7 +54,7 @@ class InitialPoints:
                 priors.close()
 
 
-def align_priors(run: Run, scene: Scene, begun: bool) -> Alignment | None:
+def align_priors(run: Run, scene: Scene, begun: bool) -> DepthAlignment | None:
     """The alignment of the depth priors of a run with its scene, if pretraining needs any.
 
     Raises:

@@ -32,7 +32,7 @@ PACE_OVER = 100
 
 
 @dataclass(frozen=True)
-class Block:
+class BlockStatus:
     """Where one block stands.
 
     Attributes:
@@ -64,7 +64,7 @@ class Block:
     reduced: tuple[str, ...] = ()
 
 
-KNOWN = tuple(field.name for field in fields(Block) if field.name not in ("index", "views"))
+SHOWN_FIELDS = tuple(field.name for field in fields(BlockStatus) if field.name not in ("index", "views"))
 """What is shown of the state of a block."""
 
 
@@ -106,7 +106,7 @@ class Status:
     metrics: dict[str, Any] | None = None
     notes: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[BlockStatus, ...] = ()
 
 
 def status(out: Path) -> Status:
@@ -145,11 +145,11 @@ def status(out: Path) -> Status:
 
 def _latest(out: Path) -> Path:
     """The journal of the stage that the run is in: refinements have their own, as their steps are counted anew."""
-    refined = (out / f"refine{at}" / journal.NAME for at in itertools.count())
-    return [out / journal.NAME, *itertools.takewhile(Path.exists, refined)][-1]
+    refined = (out / f"refine{at}" / journal.JOURNAL_FILE for at in itertools.count())
+    return [out / journal.JOURNAL_FILE, *itertools.takewhile(Path.exists, refined)][-1]
 
 
-def _blocks(folder: Path) -> tuple[Block, ...]:
+def _blocks(folder: Path) -> tuple[BlockStatus, ...]:
     """Where the blocks of a run stand, by what lies in their folders."""
     path = folder / "plan.json"
     if not path.exists():
@@ -162,11 +162,11 @@ def _blocks(folder: Path) -> tuple[Block, ...]:
     found = []
     for index, count in enumerate(views):
         state = read_state(folder / f"{index:03}")
-        found.append(Block(index, count, **{name: getattr(state, name) for name in KNOWN}))
+        found.append(BlockStatus(index, count, **{name: getattr(state, name) for name in SHOWN_FIELDS}))
     return tuple(found)
 
 
-def _left(stage: float | None, blocks: tuple[Block, ...]) -> float | None:
+def _left(stage: float | None, blocks: tuple[BlockStatus, ...]) -> float | None:
     """Seconds to the end of the blocks, while some are left to tune, else of the stage."""
     tuned = [block for block in blocks if block.views]
     waiting = any(block.status != "done" for block in tuned)

@@ -15,15 +15,15 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import DISK_FULL, being_written, remove, sweep, sync_folder
 from surfkit.runs import journal
 
-RECORD = "entry.json"
+ENTRY_RECORD = "entry.json"
 """In the folder of an entry, what is in it; written last, before the folder gets its name."""
 
-PIECE = 1 << 20
+READ_BYTES = 1 << 20
 """Bytes that are read at a time."""
 
 
 @dataclass(frozen=True)
-class Entry:
+class CachedStage:
     """Files of a finished stage.
 
     Attributes:
@@ -41,7 +41,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class StageStore:
+class StageCache:
     """The store; several processes may use it at once.
 
     Attributes:
@@ -66,7 +66,7 @@ class StageStore:
         try:
             for name in names:
                 place(out, part, name)
-            write_json(part / RECORD, {name: digest(part / name) for name in names})
+            write_json(part / ENTRY_RECORD, {name: digest(part / name) for name in names})
             os.rename(part, home)
             sync_folder(self.folder)
         except OSError:
@@ -75,13 +75,13 @@ class StageStore:
         finally:
             remove(part)
 
-    def find(self, key: str) -> Entry | None:
+    def find(self, key: str) -> CachedStage | None:
         """The entry of a key, if it is whole; one that is damaged is deleted, with a warning."""
         home = self.folder / key
         if not home.exists():
             return None
         try:
-            found = Entry(home, read_json(home / RECORD, dict[str, str]))
+            found = CachedStage(home, read_json(home / ENTRY_RECORD, dict[str, str]))
             wrong = next((name for name, known in found.files.items() if digest(home / name) != known), None)
             why = None if wrong is None else f"{home / wrong}: its checksum does not fit"
         except (BadInput, OSError) as error:
@@ -133,13 +133,13 @@ def linked(source: Path, target: Path) -> bool:
 
 def is_changed_in_place(name: str) -> bool:
     """Whether a file of a run may be written to without a new one taking its place: journals, and files of methods."""
-    return name.endswith(journal.NAME) or name.startswith("method/")
+    return name.endswith(journal.JOURNAL_FILE) or name.startswith("method/")
 
 
 def digest(path: Path) -> str:
     """SHA-256 of a file."""
     found = hashlib.sha256()
     with path.open("rb") as file:
-        while piece := file.read(PIECE):
+        while piece := file.read(READ_BYTES):
             found.update(piece)
     return found.hexdigest()

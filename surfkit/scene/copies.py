@@ -14,13 +14,13 @@ from surfkit.core.caches import cache_root
 from surfkit.core.files import replacing
 from surfkit.scene.arrays import map_array, write_array
 
-FOLDER = "resized"
-ENDS = 1 << 16
+RESIZED_FOLDER = "resized"
+FINGERPRINT_BYTES = 1 << 16
 """Bytes at either end of a file that stand for all of it."""
 
 
 @dataclass(frozen=True)
-class Copies:
+class DecodedPhotoCache:
     """Decoded photographs on disk, for those that do not fit into memory.
 
     Attributes:
@@ -38,7 +38,7 @@ class Copies:
             shape: Of the copy.
             make: Gives an array of uint8.
         """
-        copy = place(self.root, FOLDER) / f"{path.stem}-{digest(self.root, key, [path])}.npy"
+        copy = place(self.root, RESIZED_FOLDER) / f"{path.stem}-{digest(self.root, key, [path])}.npy"
         try:
             pixels = map_array(copy)
             if pixels.shape == shape and pixels.dtype == np.uint8:
@@ -70,6 +70,6 @@ def _content(path: Path) -> bytes:
     """Size and both ends of a file; whole photographs would take minutes to read in a large data set."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(ENDS)
-        file.seek(max(0, size - ENDS))
+        head = file.read(FINGERPRINT_BYTES)
+        file.seek(max(0, size - FINGERPRINT_BYTES))
         return size.to_bytes(8, "little") + head + file.read()

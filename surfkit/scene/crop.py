@@ -15,7 +15,7 @@ Axis = Literal["x", "y", "z"]
 
 PLANES = {"x": (1, 2), "y": (0, 2), "z": (0, 1)}
 """Axes of the polygon's plane, by the axis that stands on it."""
-KIND = "SelectionPolygonVolume"
+POLYGON_CLASS = "SelectionPolygonVolume"
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def write_crop(path: Path, crop: Crop) -> None:
             "axis_max": crop.high,
             "axis_min": crop.low,
             "bounding_polygon": corners.tolist(),
-            "class_name": KIND,
+            "class_name": POLYGON_CLASS,
             "orthogonal_axis": crop.axis.upper(),
             "version_major": 1,
             "version_minor": 0,

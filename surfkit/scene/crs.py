@@ -25,26 +25,26 @@ NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
 TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+lon_0={NUMBER} \+h_0={NUMBER}")
 EGM96 = "+5773"
 """What the code of a map ends with where heights are above sea level by EGM96, the geoid that receivers of GPS know."""
-UTM = re.compile(rf"EPSG:32([67])(0[1-9]|[1-5]\d|60)({re.escape(EGM96)})?", re.IGNORECASE)
-POLAR, BESIDE = 84.0, 30.0
+UTM_PATTERN = re.compile(rf"EPSG:32([67])(0[1-9]|[1-5]\d|60)({re.escape(EGM96)})?", re.IGNORECASE)
+MAX_UTM_LATITUDE, MAX_UTM_OFFSET_DEGREES = 84.0, 30.0
 """Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
-DEGREES = "EPSG:4326"
-UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
+LATLON_CRS = "EPSG:4326"
+UNIT_ABBREVIATIONS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
 """Short names of units of length, by those of EPSG."""
 SAME_UNIT = 1e-5
 """Largest difference of two units that are one, as a share: feet of the two kinds differ by 2e-6."""
 UNIT_OFF = 0.01
 """Largest difference, as a share, of a stated unit from that of the coordinate reference system."""
-STEP_M = 100.0
+SCALE_STEP_M = 100.0
 """Over which lengths on the map are measured."""
-MARGIN = 1.0
+AREA_MARGIN_DEGREES = 1.0
 """Degrees beyond the area of a transformation that it is still used in."""
 COARSE_M = 2.0
 """Accuracy of a transformation from which on a better one is told of, where it lacks its grid only."""
 
 
 @dataclass(frozen=True)
-class Axes:
+class AxisUnits:
     """Units of a system of easting and northing.
 
     Attributes:
@@ -62,7 +62,7 @@ class Axes:
     @property
     def symbol(self) -> str:
         """The unit behind numbers, such as "m" or "US ft"."""
-        return UNITS.get(self.unit, self.unit)
+        return UNIT_ABBREVIATIONS.get(self.unit, self.unit)
 
 
 def parsed(crs: str) -> CRS:
@@ -116,7 +116,7 @@ def metres_of(crs: CRS) -> float | None:
     return metres if 0 < metres < 1e6 else None
 
 
-def axes_of(crs: str) -> Axes:
+def axes_of(crs: str) -> AxisUnits:
     """The units of a system.
 
     Raises:
@@ -124,7 +124,7 @@ def axes_of(crs: str) -> Axes:
             those; or pyproj does not know it.
     """
     if is_plain(crs):
-        return Axes(height_metres=1.0, height_unit="metre") if crs.endswith(EGM96) else Axes()
+        return AxisUnits(height_metres=1.0, height_unit="metre") if crs.endswith(EGM96) else AxisUnits()
     given = parsed(crs)
     if given.is_geographic:
         raise BadInput(f"{crs}: it is in degrees, where lengths belong; name a projected one, such as EPSG:32633")
@@ -144,22 +144,22 @@ def axes_of(crs: str) -> Axes:
             f"{crs}: easting and northing are in units of {x.unit_name}, heights in {up[0].unit_name}; a scene has one "
             f"unit on all axes: name a system with one{feet}"
         )
-    return Axes(metres, x.unit_name, heights, up[0].unit_name if up else "")
+    return AxisUnits(metres, x.unit_name, heights, up[0].unit_name if up else "")
 
 
 def is_plain(crs: str) -> bool:
     """Whether it is a zone of UTM on WGS 84, with or without heights by EGM96, or a topocentric frame, in metres: they
     are computed here, but for the heights of the geoid."""
-    return bool(UTM.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
+    return bool(UTM_PATTERN.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
 
 
 def zone_of(crs: str) -> tuple[int, bool] | None:
     """Number of a zone of UTM on WGS 84, and whether it is south of the equator; None for any other system."""
-    found = UTM.fullmatch(crs)
+    found = UTM_PATTERN.fullmatch(crs)
     return (int(found[2]), found[1] == "7") if found and not found[3] else None
 
 
-def known_axes(crs: str) -> Axes | None:
+def known_axes(crs: str) -> AxisUnits | None:
     """The same; None where it is none of a map with one unit."""
     try:
         return axes_of(crs)
@@ -194,12 +194,12 @@ def scale_at(crs: str, place: np.ndarray) -> float:
     """
     if is_plain(crs):
         return 1.0
-    steps = STEP_M / axes_of(crs).metres * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+    steps = SCALE_STEP_M / axes_of(crs).metres * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
     lon, lat = degrees_of(crs, np.asarray(place, np.float64)[:2] + steps)
     if not np.isfinite([lon, lat]).all():
         return 1.0
     lengths = Geod(ellps="WGS84").inv(lon[[0, 2]], lat[[0, 2]], lon[[1, 3]], lat[[1, 3]])[2]
-    return float(np.sqrt(np.prod(lengths)) / (2 * STEP_M))
+    return float(np.sqrt(np.prod(lengths)) / (2 * SCALE_STEP_M))
 
 
 def degrees_of(crs: str, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -232,8 +232,8 @@ def used_beyond(known: Any, lon: float, lat: float) -> bool:
     if area is None:
         return False
     wide = (area.east - area.west) % 360 or 360.0
-    along = (lon - area.west + MARGIN) % 360 <= wide + 2 * MARGIN
-    return not (along and area.south - MARGIN <= lat <= area.north + MARGIN)
+    along = (lon - area.west + AREA_MARGIN_DEGREES) % 360 <= wide + 2 * AREA_MARGIN_DEGREES
+    return not (along and area.south - AREA_MARGIN_DEGREES <= lat <= area.north + AREA_MARGIN_DEGREES)
 
 
 def missing(source: Any, target: Any, lon: float, lat: float) -> tuple[list[str], float]:

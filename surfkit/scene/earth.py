@@ -16,10 +16,10 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.scene.crs import (
     COARSE_M,
-    DEGREES,
     EGM96,
+    LATLON_CRS,
     TOPOCENTRIC,
-    UTM,
+    UTM_PATTERN,
     axes_of,
     degrees_of,
     exact,
@@ -31,22 +31,22 @@ from surfkit.scene.crs import (
 )  # fmt: skip
 from surfkit.scene.geoid import Geoid
 
-AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
+SEMI_MAJOR_AXIS_M, FLATTENING = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis, metres, and flattening."""
 UTM_SCALE, UTM_EAST, UTM_SOUTH = 0.9996, 500_000.0, 10_000_000.0
 """Scale on the central meridian; false easting, and northing south of the equator, metres."""
-STEP_M = 100.0
+AXIS_STEP_M = 100.0
 """Over which the directions of the axes are measured."""
-UNEVEN = 0.01
+MAX_AXIS_UNIT_DIFFERENCE = 0.01
 """Most that the units of the axes differ by, as a share, in coordinates that are lengths."""
-EARTH, HEIGHTS = "EPSG:4978", "EPSG:4979"
+GEOCENTRIC_CRS, GEODETIC_CRS = "EPSG:4978", "EPSG:4979"
 """WGS 84: metres from the centre of the Earth; degrees and metres above the ellipsoid."""
 Convert = Callable[[np.ndarray], np.ndarray]
 """(P, 3) metres from the centre of the Earth (EPSG:4978), of (P, 3) easting, northing and height."""
 
 
 @dataclass(frozen=True)
-class Site:
+class LocalEarthFrame:
     """Metres about a place on Earth, with the axes of a coordinate reference system as they are there.
 
     Attributes:
@@ -64,7 +64,7 @@ class Site:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def at(cls, crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> Site:
+    def at(cls, crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> LocalEarthFrame:
         """The site of a place.
 
         Args:
@@ -78,14 +78,14 @@ class Site:
         """
         metres = axes_of(crs).metres
         convert, notes = on_earth(crs, origin, geoid)
-        steps = STEP_M / metres * np.concatenate([np.eye(3), -np.eye(3)])
+        steps = AXIS_STEP_M / metres * np.concatenate([np.eye(3), -np.eye(3)])
         around = convert(origin + steps)
-        axes = ((around[:3] - around[3:]) / (2 * STEP_M / metres)).T
+        axes = ((around[:3] - around[3:]) / (2 * AXIS_STEP_M / metres)).T
         units = np.linalg.norm(axes, axis=0)
         shown = " ".join(f"{value:.15g}" for value in origin)
         if not (np.isfinite(units).all() and np.linalg.det(axes) > 0):
             raise BadInput(f"{crs} at {shown}: its axes are not east, north and up there; name the system of the place")
-        if not units.max() * (1 - UNEVEN) <= units.min():
+        if not units.max() * (1 - MAX_AXIS_UNIT_DIFFERENCE) <= units.min():
             raise BadInput(
                 f"{crs} at {shown}: 1 m to the east or north is {metres / units[:2].min():.4g} to "
                 f"{metres / units[:2].max():.4g} m on the map, and 1 m of height is {metres / units[2]:.4g}; "
@@ -133,12 +133,12 @@ def on_earth(crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> tuple[
         unit, whole = 1.0, given
         if axes.height_metres is None:
             unit, whole, notes = axes.metres, given.to_3d(), untold
-        known = exact(whole, EARTH)
+        known = exact(whole, GEOCENTRIC_CRS)
         if known is not None:
             said = _refused_or_told(crs, known, whole, origin * [1, 1, unit])
             return lambda xyz: _transformed(crs, known, np.asarray(xyz, np.float64) * [1, 1, unit]), (*notes, *said)
     flat = given.to_2d()
-    plan = exact(flat, DEGREES)
+    plan = exact(flat, LATLON_CRS)
     said = _refused_or_told(crs, plan, flat, origin[:2])
     if geoid is None:
         notes = (_without_grid(crs, given, origin),)
@@ -157,7 +157,7 @@ def geocentric(latitude: np.ndarray | float, longitude: np.ndarray | float, heig
     """(..., 3) ECEF metres of degrees and metres above the ellipsoid."""
     phi, lam = np.radians(latitude), np.radians(longitude)
     squared = FLATTENING * (2 - FLATTENING)
-    across = AXIS / np.sqrt(1 - squared * np.sin(phi) ** 2)  # radius of curvature in the prime vertical
+    across = SEMI_MAJOR_AXIS_M / np.sqrt(1 - squared * np.sin(phi) ** 2)  # radius of curvature in the prime vertical
     flat = (across + height) * np.cos(phi)
     return np.stack([flat * np.cos(lam), flat * np.sin(lam), (across * (1 - squared) + height) * np.sin(phi)], axis=-1)
 
@@ -215,12 +215,12 @@ def from_utm(east: np.ndarray, north: np.ndarray, zone: int, south: bool) -> tup
 def _third_flattening() -> tuple[float, float]:
     """Of WGS 84, and the radius of the rectifying sphere, metres."""
     n = FLATTENING / (2 - FLATTENING)
-    return n, AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    return n, SEMI_MAJOR_AXIS_M / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
 
 
 def _plainly(crs: str, xyz: np.ndarray, geoid: Geoid | None) -> np.ndarray:
     """ECEF of coordinates of UTM on WGS 84, or of a topocentric frame."""
-    if found := UTM.fullmatch(crs):
+    if found := UTM_PATTERN.fullmatch(crs):
         latitude, longitude = from_utm(xyz[:, 0], xyz[:, 1], int(found[2]), found[1] == "7")
         above = 0.0 if geoid is None else geoid(latitude, longitude)
         return geocentric(latitude, longitude, xyz[:, 2] + above)
@@ -243,7 +243,7 @@ def _refused_or_told(crs: str, known: Any, source: Any, place: np.ndarray) -> tu
     longitude, latitude = (float(at[0]) for at in degrees_of(crs, place[None]))
     if not np.isfinite([longitude, latitude]).all():
         raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place some of the coordinates on Earth")
-    grids, best = missing(source, HEIGHTS if len(place) == 3 else DEGREES, longitude, latitude)
+    grids, best = missing(source, GEODETIC_CRS if len(place) == 3 else LATLON_CRS, longitude, latitude)
     here, remedy = f"latitude {latitude:.4f}, longitude {longitude:.4f}", not_installed(grids) or "name another system"
     if known is None:
         raise BadInput(
@@ -262,7 +262,7 @@ def _refused_or_told(crs: str, known: Any, source: Any, place: np.ndarray) -> tu
 def _without_grid(crs: str, given: Any, origin: np.ndarray) -> str:
     """That heights above a geoid are taken as above the ellipsoid, and what is missing."""
     longitude, latitude = (float(at[0]) for at in degrees_of(crs, origin[None]))
-    grids, _ = missing(given, HEIGHTS, longitude, latitude)
+    grids, _ = missing(given, GEODETIC_CRS, longitude, latitude)
     why = f"{not_installed(grids)}, or" if grids else "PROJ knows no geoid for them;"
     return (
         f"{crs}: its heights, above sea level, are taken as above the ellipsoid, up to 100 m off: {why} give the geoid "

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class Gate:
+class ByteSemaphore:
     """A semaphore over bytes: threads wait until there is room; a single one may exceed the limit."""
 
     def __init__(self, most: int) -> None:

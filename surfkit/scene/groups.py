@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import connected_components
 
 from surfkit.core.check import few
 
-BATCH = 20_000
+BATCH_TRACKS = 20_000
 """Points between two checks whether all photographs are connected."""
-SHOWN = 4
+LISTED_GROUPS = 4
 """Smaller groups that are listed, each with its size."""
 
 
@@ -28,7 +28,7 @@ def connect_groups(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarr
         tracks: For each point, positions of the photographs that show it.
     """
     labels, shown, tracks = np.arange(count), np.zeros(count, bool), iter(tracks)
-    while (labels != labels[:1]).any() and (batch := list(islice(tracks, BATCH))):
+    while (labels != labels[:1]).any() and (batch := list(islice(tracks, BATCH_TRACKS))):
         each = np.concatenate([np.asarray(track, np.int64) for track in batch])
         first = np.repeat([track[0] if len(track) else 0 for track in batch], [len(track) for track in batch])
         links = coo_matrix((np.ones(len(each), bool), (labels[first], labels[each])), (count, count))
@@ -48,7 +48,7 @@ def groups_warning(groups: Sequence[Sequence[str]]) -> str | None:
     """
     if len(groups) < 2:
         return None
-    sizes = [f"{len(groups[0])}", *(f"{len(names)} ({names[0]!r} for one)" for names in groups[1 : 1 + SHOWN])]
+    sizes = [f"{len(groups[0])}", *(f"{len(names)} ({names[0]!r} for one)" for names in groups[1 : 1 + LISTED_GROUPS])]
     if more := len(groups) - len(sizes):
         sizes.append(f"{more} more of up to {len(groups[len(sizes)])}")
     return (

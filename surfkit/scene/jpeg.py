@@ -11,11 +11,11 @@ import numpy as np
 from surfkit.core.events import Warned, emit
 from surfkit.scene.large import open_image
 
-END = b"\xff\xd9"
+EOI_MARKER = b"\xff\xd9"
 """The marker EOI, which ends a JPEG file."""
-OTHER = b"\xa5\x5a" * 512
+MISSING_PIXEL_BYTES = b"\xa5\x5a" * 512
 """What would become pixels if some were missing."""
-_LOCK, _told = threading.Lock(), [False]
+_WARNING_LOCK, _told = threading.Lock(), [False]
 
 
 def with_end(path: Path) -> bytes | None:
@@ -25,17 +25,17 @@ def with_end(path: Path) -> bytes | None:
     after it and without: if pixels are missing, these become some.
     """
     data = path.read_bytes()
-    if data.endswith(END):
+    if data.endswith(EOI_MARKER):
         return None
-    data = data[:-1] if data.endswith(END[:1]) else data
-    if not np.array_equal(*(_pixels(data + more + END) for more in (b"", OTHER))):
+    data = data[:-1] if data.endswith(EOI_MARKER[:1]) else data
+    if not np.array_equal(*(_pixels(data + more + EOI_MARKER) for more in (b"", MISSING_PIXEL_BYTES))):
         return None
-    return data + END
+    return data + EOI_MARKER
 
 
 def tell(path: Path) -> None:
     """Say, once, that such files are read."""
-    with _LOCK:
+    with _WARNING_LOCK:
         told, _told[0] = _told[0], True
     if not told:
         emit(

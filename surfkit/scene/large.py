@@ -15,17 +15,17 @@ from surfkit.core.check import BadInput
 from surfkit.core.memory import size as in_words
 from surfkit.scene.memory import free_bytes
 
-LIMIT = "SURFKIT_MAX_MEGAPIXELS"
+MEGAPIXELS_VARIABLE = "SURFKIT_MAX_MEGAPIXELS"
 """Environment variable: the most million pixels of a photograph that is decoded, whatever memory there is."""
-ORDINARY = 178_956_970
+MAX_UNCHECKED_PIXELS = 178_956_970
 """Pixels up to which memory is not asked about: where Pillow begins to refuse by itself."""
-ROOM = 0.8
+DECODE_MEMORY_SHARE = 0.8
 """Share of the free memory that decoding one photograph may take."""
-DECODED, WITH_OPACITY, SIXTEEN, SIXTEEN_COLOURS = 8, 16, 12, 40
+DECODED_PIXEL_BYTES, OPACITY_PIXEL_BYTES, GREY16_PIXEL_BYTES, RGB16_PIXEL_BYTES = 8, 16, 12, 40
 """Bytes per pixel while a photograph is decoded and converted: of 8 bits, with an opacity, of 16 bits grey or RGB."""
-MADE = 10
+RESULT_PIXEL_BYTES = 10
 """Bytes per pixel of the result, with what reducing it takes."""
-_LOCK = threading.Lock()
+_LIMIT_LOCK = threading.Lock()
 _within: list[int | None] = []
 """What Pillow's own limit was, once for each that has put it away."""
 
@@ -33,13 +33,13 @@ _within: list[int | None] = []
 @contextmanager
 def any_size() -> Iterator[None]:
     """Within, Pillow refuses no size by itself, also in other threads: whoever decodes asks `refuse_too_large`."""
-    with _LOCK:
+    with _LIMIT_LOCK:
         _within.append(_within[0] if _within else Image.MAX_IMAGE_PIXELS)
         Image.MAX_IMAGE_PIXELS = None
     try:
         yield
     finally:
-        with _LOCK:
+        with _LIMIT_LOCK:
             limit = _within.pop()
             if not _within:
                 Image.MAX_IMAGE_PIXELS = limit
@@ -66,25 +66,27 @@ def refuse_too_large(path: Path, shape: tuple[int, int], per_pixel: int, made: i
     pixels, limit = shape[0] * shape[1], _limit()
     what = f"{path}: {shape[0]:,} x {shape[1]:,} px ({pixels / 1e6:,.0f} megapixels)"
     if limit is not None and pixels > limit * 1e6:
-        raise BadInput(f"{what} is more than the limit {LIMIT}={limit:g}; raise it, or reduce the photograph")
-    if limit is not None or pixels <= ORDINARY:
+        raise BadInput(
+            f"{what} is more than the limit {MEGAPIXELS_VARIABLE}={limit:g}; raise it, or reduce the photograph"
+        )
+    if limit is not None or pixels <= MAX_UNCHECKED_PIXELS:
         return
-    need, free = per_pixel * pixels + MADE * made, free_bytes()
-    if need > ROOM * free:
+    need, free = per_pixel * pixels + RESULT_PIXEL_BYTES * made, free_bytes()
+    if need > DECODE_MEMORY_SHARE * free:
         raise BadInput(
             f"{what} needs {in_words(need)} of memory to decode, and {in_words(free)} are free; reduce the photograph, "
-            f"or set the limit {LIMIT}={-(-pixels // 10**6)} to decode it whatever is free"
+            f"or set the limit {MEGAPIXELS_VARIABLE}={-(-pixels // 10**6)} to decode it whatever is free"
         )
 
 
 def is_ordinary(shape: tuple[int, int]) -> bool:
     """Whether a photograph is decoded without a question."""
-    return shape[0] * shape[1] <= ORDINARY and _limit() is None
+    return shape[0] * shape[1] <= MAX_UNCHECKED_PIXELS and _limit() is None
 
 
 def _limit() -> float | None:
     """The most million pixels, if the user gives them."""
-    text = os.environ.get(LIMIT, "").strip()
+    text = os.environ.get(MEGAPIXELS_VARIABLE, "").strip()
     if not text:
         return None
     try:
@@ -92,5 +94,5 @@ def _limit() -> float | None:
     except ValueError:
         limit = 0
     if not 0 < limit < float("inf"):
-        raise BadInput(f"{LIMIT}={text}: give the most million pixels of a photograph, such as 500")
+        raise BadInput(f"{MEGAPIXELS_VARIABLE}={text}: give the most million pixels of a photograph, such as 500")
     return limit

@@ -10,13 +10,23 @@ import psutil
 
 from surfkit.core.check import BadInput
 
-SHARE = 0.5
+CACHE_SHARE = 0.5
 """Of the free memory that the cache takes by default: the points and the rasterizer need the rest."""
-UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
-MOST = 10**15
+BYTE_UNITS = {
+    "": 1,
+    "k": 10**3,
+    "m": 10**6,
+    "g": 10**9,
+    "t": 10**12,
+    "ki": 2**10,
+    "mi": 2**20,
+    "gi": 2**30,
+    "ti": 2**40,
+}
+MAX_SIZE_BYTES = 10**15
 """Bytes that can be asked for."""
-GROUPS = Path("/sys/fs/cgroup")
-OWN = Path("/proc/self/cgroup")
+CGROUP_ROOT = Path("/sys/fs/cgroup")
+PROCESS_CGROUP = Path("/proc/self/cgroup")
 VMSTAT = Path("/proc/vmstat")
 
 
@@ -28,12 +38,12 @@ def cache_bytes(
     `other`: what messages name beside a size.
     """
     if text.strip().lower() == "auto":
-        return int(SHARE * free_bytes()) if auto is None else auto()
+        return int(CACHE_SHARE * free_bytes()) if auto is None else auto()
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
-    if not found or found[2] not in UNITS:
+    if not found or found[2] not in BYTE_UNITS:
         raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB{other}")
-    size = float(found[1]) * UNITS[found[2]]
-    if size > MOST:
+    size = float(found[1]) * BYTE_UNITS[found[2]]
+    if size > MAX_SIZE_BYTES:
         raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, of at most 1000TB{other}")
     return int(size)
 
@@ -78,14 +88,14 @@ def _unreserved() -> Iterator[int]:
 def _groups() -> Iterator[Path]:
     """Folders of the groups that this process is in, and of those around them; version 2, then version 1."""
     try:
-        lines = OWN.read_text().splitlines()
+        lines = PROCESS_CGROUP.read_text().splitlines()
     except OSError:
         return
     for line in lines:
         _, controllers, name = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
             continue
-        root = GROUPS / "memory" if controllers else GROUPS
+        root = CGROUP_ROOT / "memory" if controllers else CGROUP_ROOT
         path = Path(name.lstrip("/"))
         yield from (root / inner for inner in (path, *path.parents))
 

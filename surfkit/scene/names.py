@@ -11,10 +11,12 @@ from typing import TypeVar
 from surfkit.core.events import Warned, emit
 
 T = TypeVar("T")
-HEIF = frozenset({".heic", ".heif"})
+HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 """Photographs of telephones, that Pillow reads with pillow-heif only."""
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"}) | HEIF
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
+PICTURE_SUFFIXES = (
+    frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"}) | HEIF_SUFFIXES
+)
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
 """Videos that frames can be taken of."""
 SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
     lambda path: str(path).lower(),
@@ -55,7 +57,7 @@ def safe_path(name: str) -> PurePosixPath:
 
 def is_video(path: Path) -> bool:
     """Whether a path is that of a video, by its ending."""
-    return path.suffix.lower() in VIDEOS and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -68,7 +70,9 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     if not lost:
         return found
     taken = set(found.values())
-    spare = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in PICTURES and p not in taken and p.is_file()]
+    spare = [
+        p for p in sorted(folder.rglob("*")) if p.suffix.lower() in PICTURE_SUFFIXES and p not in taken and p.is_file()
+    ]
     for spelling in SPELLINGS:
         files = _groups({path: spelling(PurePosixPath(path.relative_to(folder).as_posix())) for path in spare})
         wanted = _groups({name: spelling(PurePosixPath(name.replace("\\", "/"))) for name in lost})

@@ -11,7 +11,7 @@ from surfkit.scene.scene import View
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observations2D:
     """The sparse points that one photograph shows.
 
     Attributes:
@@ -35,7 +35,7 @@ class Observations:
 
     xyz: np.ndarray
     error_px: np.ndarray
-    seen: Mapping[str, Seen]
+    seen: Mapping[str, Observations2D]
 
     @property
     def is_empty(self) -> bool:

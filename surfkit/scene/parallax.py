@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-NARROW, WIDE = 1 / 3, 1.5
+WIDTH_BELOW, WIDTH_ABOVE = 1 / 3, 1.5
 """Width of the worth below and above the preferred angle, as shares of that angle."""
-LEAST = 1 / 12
+MIN_ANGLE_SHARE = 1 / 12
 """Share of the preferred angle below which rays are worth nothing: photographs taken from one place match at any
 depth, so they confirm whatever is tried."""
 
@@ -20,13 +20,13 @@ def degrees_between(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> n
 
 def least_apart(distance: float, angle: float) -> float:
     """How far apart two places are at least whose rays to a point at a distance from one are worth something."""
-    return distance * float(np.sin(np.radians(LEAST * angle)))
+    return distance * float(np.sin(np.radians(MIN_ANGLE_SHARE * angle)))
 
 
 def worth(between: np.ndarray, angle: float) -> np.ndarray:
-    """Worth of angles, degrees, in [0, 1]: exp(-(a - angle)^2 / 2 s^2), and 0 below `LEAST`.
+    """Worth of angles, degrees, in [0, 1]: exp(-(a - angle)^2 / 2 s^2), and 0 below `MIN_ANGLE_SHARE`.
 
     s is small below the preferred angle, where there is little parallax, and large above, where photographs differ.
     """
-    spread = angle * np.where(between < angle, NARROW, WIDE)
-    return np.where(between < LEAST * angle, 0, np.exp(-((between - angle) ** 2) / (2 * spread**2)))
+    spread = angle * np.where(between < angle, WIDTH_BELOW, WIDTH_ABOVE)
+    return np.where(between < MIN_ANGLE_SHARE * angle, 0, np.exp(-((between - angle) ** 2) / (2 * spread**2)))

@@ -17,37 +17,40 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.scene.cache import Cache
-from surfkit.scene.copies import Copies
-from surfkit.scene.gate import Gate
+from surfkit.scene.copies import DecodedPhotoCache
+from surfkit.scene.gate import ByteSemaphore
 from surfkit.scene.jpeg import tell, with_end
 from surfkit.scene.large import (
-    DECODED,
-    SIXTEEN,
-    SIXTEEN_COLOURS,
-    WITH_OPACITY,
+    DECODED_PIXEL_BYTES,
+    GREY16_PIXEL_BYTES,
+    OPACITY_PIXEL_BYTES,
+    RGB16_PIXEL_BYTES,
     any_size,
     is_ordinary,
     open_image,
     refuse_too_large,
 )
-from surfkit.scene.names import HEIF
-from surfkit.scene.pixels import ORIENTATION, PLAIN, Pixels, kind_of, to_rgb
+from surfkit.scene.names import HEIF_SUFFIXES
+from surfkit.scene.pixels import DEFAULT_PIXELS, ORIENTATION_TAG, Pixels, kind_of, to_rgb
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
-WIDTH, HEIGHT = 0x0100, 0x0101
+WIDTH_TAG, HEIGHT_TAG = 0x0100, 0x0101
 """Tags of TIFF: the size as stored."""
 # Whether a photograph is too large, `surfkit.scene.large` says.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
-RECIPE = "1"
+CACHE_VERSION = "1"
 """Changes when the same photograph would be read otherwise: copies on disk are then made again."""
-MOST_OPEN = 256 << 20
+MAX_OPEN_BYTES = 256 << 20
 """Bytes of photographs, as large as they are on disk, that may be decoded at the same time; one always may."""
-GATE = Gate(MOST_OPEN)
+DECODE_GATE = ByteSemaphore(MAX_OPEN_BYTES)
 
 
 def photo_cache(
-    views: Sequence[View], budget_bytes: int | None = None, copies: Copies | None = None, threads: int | None = None
+    views: Sequence[View],
+    budget_bytes: int | None = None,
+    copies: DecodedPhotoCache | None = None,
+    threads: int | None = None,
 ) -> Cache[Tensor]:
     """The photographs of views by position, (3, H, W) uint8; with `copies`, decoded only once, also between runs."""
     sizes = [3 * view.camera.width * view.camera.height for view in views]
@@ -57,7 +60,7 @@ def photo_cache(
     def read(at: int) -> Tensor:
         view = views[at]
         shape = (3, view.camera.height, view.camera.width)
-        key = f"{RECIPE} {shape} {view.white}" + (f" {view.pixels}" if view.pixels != PLAIN else "")
+        key = f"{CACHE_VERSION} {shape} {view.white}" + (f" {view.pixels}" if view.pixels != DEFAULT_PIXELS else "")
         try:
             return torch.from_numpy(copies.get(view.path, key, shape, lambda: view_photo(view).numpy()))
         except FileNotFoundError as error:
@@ -86,10 +89,10 @@ def is_turned(path: Path) -> bool:
     with _picture(path) as image:
         if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode all of it, to look behind
             return False
-        return image.getexif().get(ORIENTATION, 1) not in (0, 1)
+        return image.getexif().get(ORIENTATION_TAG, 1) not in (0, 1)
 
 
-def read_photo(path: Path, size: tuple[int, int], white: bool = False, pixels: Pixels = PLAIN) -> Tensor:
+def read_photo(path: Path, size: tuple[int, int], white: bool = False, pixels: Pixels = DEFAULT_PIXELS) -> Tensor:
     """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter.
 
     Args:
@@ -113,7 +116,7 @@ def read_photo(path: Path, size: tuple[int, int], white: bool = False, pixels: P
     return torch.from_numpy(open_picture(path, decode, size)).permute(2, 0, 1).contiguous()
 
 
-def read_draft(path: Path, longest: int, pixels: Pixels = PLAIN) -> np.ndarray:
+def read_draft(path: Path, longest: int, pixels: Pixels = DEFAULT_PIXELS) -> np.ndarray:
     """(h, w, 3) uint8 RGB of a picture at a fraction of its size, the longer side `longest` to twice that if it can be.
 
     All of the file is read, but a JPEG is never held at its full size.
@@ -139,7 +142,7 @@ def require_heif(what: str) -> None:
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    return (image.tag_v2[WIDTH], image.tag_v2[HEIGHT]) if image.format == "TIFF" else image.size
+    return (image.tag_v2[WIDTH_TAG], image.tag_v2[HEIGHT_TAG]) if image.format == "TIFF" else image.size
 
 
 def open_header(path: Path, use: Callable[[Image.Image], T]) -> T:
@@ -162,7 +165,7 @@ def open_picture(
     with _picture(path) as image:
         allowed = nullcontext() if is_ordinary(image.size) else any_size()
         _ready(path, image, size, draft)
-        with allowed, GATE.taking(len(image.getbands()) * image.width * image.height):
+        with allowed, DECODE_GATE.taking(len(image.getbands()) * image.width * image.height):
             try:
                 return use(image)
             except OSError:
@@ -190,16 +193,16 @@ def _ready(path: Path, image: Image.Image, size: tuple[int, int] | None, draft: 
     if size is not None and (draft or not is_ordinary(image.size)):
         image.draft(image.mode, size if draft else (2 * size[0], 2 * size[1]))
     kind = kind_of(image)
-    per_pixel = WITH_OPACITY if kind.opacity else DECODED
+    per_pixel = OPACITY_PIXEL_BYTES if kind.opacity else DECODED_PIXEL_BYTES
     if kind.wide:
-        per_pixel = SIXTEEN if image.mode.startswith("I") else SIXTEEN_COLOURS
+        per_pixel = GREY16_PIXEL_BYTES if image.mode.startswith("I") else RGB16_PIXEL_BYTES
     refuse_too_large(path, image.size, per_pixel, size[0] * size[1] if size else 0)
 
 
 @contextmanager
 def _picture(path: Path) -> Iterator[Image.Image]:
     """The open picture, not yet decoded; within, what Pillow finds wrong becomes BadInput."""
-    if path.suffix.lower() in HEIF:
+    if path.suffix.lower() in HEIF_SUFFIXES:
         require_heif(str(path))
     try:
         with open_image(path) as image:

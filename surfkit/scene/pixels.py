@@ -14,9 +14,9 @@ from surfkit.core.check import BadInput
 from surfkit.scene.large import open_image
 
 Alpha = Literal["mask", "blend", "ignore"]
-BITS, WHITE_LEVEL, LARGEST, SAMPLES, FURTHER = 258, 50717, 281, 277, 338
+BITS_TAG, WHITE_LEVEL_TAG, MAX_SAMPLE_TAG, SAMPLES_TAG, EXTRA_SAMPLES_TAG = 258, 50717, 281, 277, 338
 """Tags of TIFF: BitsPerSample, WhiteLevel (DNG), MaxSampleValue, SamplesPerPixel, ExtraSamples."""
-ORIENTATION = 0x0112
+ORIENTATION_TAG = 0x0112
 """EXIF tag; 1 is upright."""
 TURN = Image.Transpose
 UNDONE = {
@@ -29,9 +29,9 @@ UNDONE = {
     8: TURN.ROTATE_270,
 }
 """What brings a picture back that was turned as its EXIF says."""
-TOP = 65535
+MAX_UINT16 = 65535
 """The largest value of 16 bits."""
-EXTREME = 0.5
+MIN_EXTREME_SHARE = 0.5
 """Share of the pixels that an opacity leaves wholly transparent or wholly opaque, at least; infrared does not."""
 ORDERS = {"L": "B", "B": "L", "N": "B" if sys.byteorder == "little" else "L"}
 """Orders of the two bytes of a value in a file, N for that of the machine, and the other one of each."""
@@ -55,12 +55,12 @@ class Pixels:
     alpha: Alpha = "blend"
 
 
-PLAIN = Pixels()
+DEFAULT_PIXELS = Pixels()
 """As almost all photographs are."""
 
 
 @dataclass(frozen=True)
-class Kind:
+class PixelHeader:
     """What the header of a picture says of its values.
 
     Attributes:
@@ -81,20 +81,20 @@ class Kind:
     dropped: int = 0
 
 
-def kind_of(image: Image.Image) -> Kind:
+def kind_of(image: Image.Image) -> PixelHeader:
     """What the header of an open picture says, without decoding it."""
     tags = getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
     wide = image.mode.startswith("I") or _raw_mode(image) in OTHER_HALF
-    bits = max(_numbers(tags.get(BITS, 8)))
-    level = max(_numbers(tags.get(WHITE_LEVEL, 0))) or (2**bits - 1 if 8 < bits < 16 else 0)
-    further = _numbers(tags[FURTHER]) if FURTHER in tags else ()
+    bits = max(_numbers(tags.get(BITS_TAG, 8)))
+    level = max(_numbers(tags.get(WHITE_LEVEL_TAG, 0))) or (2**bits - 1 if 8 < bits < 16 else 0)
+    further = _numbers(tags[EXTRA_SAMPLES_TAG]) if EXTRA_SAMPLES_TAG in tags else ()
     opacity = has_opacity(image)
-    return Kind(
+    return PixelHeader(
         wide=wide,
         white_level=level if wide else 0,
-        largest=max(_numbers(tags.get(LARGEST, 0))) if wide else 0,
+        largest=max(_numbers(tags.get(MAX_SAMPLE_TAG, 0))) if wide else 0,
         opacity=opacity,
-        doubtful=opacity and bool(tags) and max(_numbers(tags.get(SAMPLES, 1))) > 2,
+        doubtful=opacity and bool(tags) and max(_numbers(tags.get(SAMPLES_TAG, 1))) > 2,
         dropped=len(further) - opacity,
     )
 
@@ -112,7 +112,7 @@ def opacity_of(image: Image.Image) -> np.ndarray:
 def is_opacity(values: np.ndarray) -> bool:
     """Whether the values of a band are those of an opacity, and not of infrared light."""
     top = values.max(initial=0) == 255
-    return bool(top and np.mean((values == 0) | (values == 255)) >= EXTREME)
+    return bool(top and np.mean((values == 0) | (values == 255)) >= MIN_EXTREME_SHARE)
 
 
 def largest_of(image: Image.Image) -> int:
@@ -144,7 +144,7 @@ def to_rgb(image: Image.Image, path: Path, under: int, pixels: Pixels) -> Image.
     """
     level = pixels.white_level
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
-        return Image.fromarray(_eight_bits(np.asarray(as_stored(image)), level or TOP)).convert("RGB")
+        return Image.fromarray(_eight_bits(np.asarray(as_stored(image)), level or MAX_UINT16)).convert("RGB")
     if image.mode == "F":
         raise BadInput(f"{path}: pixels are floating point; convert it to 8 bits, for example to PNG")
     image = _stretched(image, path, level) if level and _raw_mode(image) in OTHER_HALF else as_stored(image)
@@ -160,14 +160,14 @@ def as_stored(image: Image.Image) -> Image.Image:
     """A picture before Pillow turns it: it does so, unasked, with the TIFF files among those that EXIF says to turn."""
     if image.format != "TIFF":
         return image
-    turn = image.getexif().get(ORIENTATION, 1)
+    turn = image.getexif().get(ORIENTATION_TAG, 1)
     image.load()
-    return image.transpose(UNDONE[turn]) if turn in UNDONE and ORIENTATION not in image.getexif() else image
+    return image.transpose(UNDONE[turn]) if turn in UNDONE and ORIENTATION_TAG not in image.getexif() else image
 
 
 def _eight_bits(values: np.ndarray, level: int) -> np.ndarray:
     """uint8 of values, of which `level` becomes 255."""
-    if level > TOP:
+    if level > MAX_UINT16:
         return (values.clip(0, level) * (255 / level) + 0.5).astype(np.uint8)
     table = ((np.arange(level + 1, dtype=np.int64) * 510 + level) // (2 * level)).astype(np.uint8)
     return table[values.clip(0, level)]

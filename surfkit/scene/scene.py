@@ -11,11 +11,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 
-MARGIN = 1.1
+EXTENT_FACTOR = 1.1
 """The scene extent is this times the largest distance of a training camera to their mean centre."""
-FAR = 16
+MAX_EXTENTS_OFFSET = 16
 """Beyond this many extents from 0, float32 coordinates would lose what is a millionth of the extent."""
 
 
@@ -71,11 +71,11 @@ class View:
     mask: Mask | None = None
     white: bool = False
     lens: Lens | None = None
-    pixels: Pixels = PLAIN
+    pixels: Pixels = DEFAULT_PIXELS
 
 
 @dataclass(frozen=True)
-class Cloud:
+class SparsePoints:
     """Points that splats begin at: sparse ones from structure from motion, or others.
 
     Attributes:
@@ -128,7 +128,7 @@ class Frame:
         with np.errstate(over="ignore", invalid="ignore"):  # what is infinite then is refused below
             centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
             origin = centres.mean(0)
-            reach = MARGIN * np.linalg.norm(centres - origin, axis=1).max()
+            reach = EXTENT_FACTOR * np.linalg.norm(centres - origin, axis=1).max()
             spread = np.median(np.linalg.norm(points - origin, axis=1)) if len(points) else 0.0
         extent = reach if reach > 1e-6 * spread else spread
         if not 0 < extent < np.inf:
@@ -200,12 +200,14 @@ class Scene:
     name: str
     train: tuple[View, ...]
     held_out: tuple[View, ...]
-    cloud: Cloud
+    cloud: SparsePoints
     frame: Frame
 
 
 def _shift(origin: np.ndarray, extent: float) -> tuple[float, float, float]:
     """A round number near the coordinates of the scene along each axis on which they are far from 0."""
     grain = 10.0 ** np.floor(np.log10(extent))
-    east, north, up = (float(np.round(at / grain) * grain) if abs(at) > FAR * extent else 0.0 for at in origin)
+    east, north, up = (
+        float(np.round(at / grain) * grain) if abs(at) > MAX_EXTENTS_OFFSET * extent else 0.0 for at in origin
+    )
     return east, north, up

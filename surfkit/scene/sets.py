@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-FEW = 4096
+MAX_CACHED_NUMBERS = 4096
 """Numbers that stay in the cache, so that values may be looked up among them in any order."""
 
 
 def is_among(values: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N,) bool, which of (N,) values are among (M,) others."""
     ordered = np.sort(others)
-    if len(ordered) <= FEW:
+    if len(ordered) <= MAX_CACHED_NUMBERS:
         return _looked_up(values, ordered)
     order = np.argsort(values)
     inside = values[order]  # in order, so that looking up goes through memory in order too

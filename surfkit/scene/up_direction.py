@@ -10,11 +10,11 @@ import numpy as np
 from surfkit.scene.crop import Axis
 from surfkit.scene.scene import Frame, View
 
-SPAN = 0.05
+MIN_PLANE_SPREAD = 0.05
 """Mean square of the sideways axes of the cameras along the second direction, from which they span a plane."""
-TILT = 0.2
+MAX_TILT_RATIO = 0.2
 """Of that, along the third direction, up to which the cameras are held level."""
-FLAT = 0.5
+MAX_FLATNESS_RATIO = 0.5
 """Spread of the cameras along their thinnest direction, as a share of the next, below which they fly in a plane."""
 SNAP_DEGREES = 5.0
 """From an axis of the frame within which that axis is meant."""
@@ -87,11 +87,11 @@ def up_of_views(views: Sequence[View], frame: Frame) -> np.ndarray | None:
         return np.eye(3)[2]
     turns = np.stack([view.camera.world_to_camera[:3, :3].numpy() for view in views])
     spread, axes = np.linalg.eigh(np.einsum("vi,vj->ij", turns[:, 0], turns[:, 0]) / len(turns))
-    if spread[1] < SPAN or spread[0] > TILT * spread[1]:
+    if spread[1] < MIN_PLANE_SPREAD or spread[0] > MAX_TILT_RATIO * spread[1]:
         centres = np.stack([view.camera.centre.numpy() for view in views])
         values, axes = np.linalg.eigh(np.atleast_2d(np.cov(centres.T, bias=True)))
         spread = np.sqrt(values.clip(0))
-        if not spread[1] > SPAN * spread[2] or spread[0] > FLAT * spread[1]:
+        if not spread[1] > MIN_PLANE_SPREAD * spread[2] or spread[0] > MAX_FLATNESS_RATIO * spread[1]:
             return None
     heads = -(turns[:, 1] + turns[:, 2]).mean(0)  # up in the picture, or away from the ground that is looked at
     return axes[:, 0] * (1.0 if axes[:, 0] @ heads >= 0 else -1.0)

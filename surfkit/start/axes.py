@@ -23,17 +23,17 @@ from surfkit.raster.select import select
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
 
-TRIED: tuple[Axes, ...] = ("rdf", "rub", "luf", "ldb", "rfu", "rbd")
+TRIED_AXES: tuple[Axes, ...] = ("rdf", "rub", "luf", "ldb", "rfu", "rbd")
 """Axes that are compared: those of a PLY file, half a turn from them about each axis, and quarters about x."""
-VIEWS = 4
+COMPARED_VIEWS = 4
 """Training photographs that are compared, evenly spaced."""
-LONGEST_PX = 160
+TRIAL_LONGEST_PX = 160
 """Longest side of these."""
 CLEAR_DB = 1.0
 """PSNR by which the best axes must be ahead of all others."""
-POINTS = 2_000
+COMPARED_POINTS = 2_000
 """Sparse points whose distance to the nearest splat is compared where the photographs do not tell."""
-NEIGHBOURS = 200_000
+MAX_COMPARED_SPLATS = 200_000
 """Splats that these are compared with at most."""
 CLEAR_SHARE = 0.5
 """Of the median distance for all other axes, what that for the best must stay below."""
@@ -81,10 +81,10 @@ def _decibels(table: SplatTable, scene: Scene) -> dict[Axes, float]:
     """Mean PSNR of some photographs at a small size, for each axes; 0 where none can be read. Spherical harmonics above
     degree 0 are left out: to turn them takes more memory than all else."""
     plain = replace(table, sh_rest=table.sh_rest[:, :0])
-    photos = [photo for view in scene.train[:: math.ceil(len(scene.train) / VIEWS)] if (photo := _small(view))]
+    photos = [photo for view in scene.train[:: math.ceil(len(scene.train) / COMPARED_VIEWS)] if (photo := _small(view))]
     rasterizer, _ = select("cpu")
     found = {}
-    for name in dict.fromkeys((table.axes.name, *TRIED)):
+    for name in dict.fromkeys((table.axes.name, *TRIED_AXES)):
         local, primitive = in_scene(from_axes(plain, name), scene.frame), primitive_of(plain)
         model = SplatModel(primitive, primitive.from_table(local, torch.Generator()))
         draws, total = drawn_by(primitive, rasterizer), 0.0
@@ -97,7 +97,7 @@ def _decibels(table: SplatTable, scene: Scene) -> dict[Axes, float]:
 
 def _small(view: View) -> tuple[View, torch.Tensor] | None:
     """A view at LONGEST_PX and its (3, H, W) photograph in [0, 1]; None if that cannot be read."""
-    small = replace(view, camera=view.camera.fitted(LONGEST_PX))
+    small = replace(view, camera=view.camera.fitted(TRIAL_LONGEST_PX))
     try:
         return small, view_photo(small).float() / 255
     except BadInput:  # the run itself says so
@@ -107,9 +107,9 @@ def _small(view: View) -> tuple[View, torch.Tensor] | None:
 def _distances(table: SplatTable, scene: Scene) -> dict[Axes, float]:
     """For each axes, the median distance of sparse points to the nearest splat; infinite without points."""
     points, found = scene.cloud.xyz.numpy(), {}
-    points = points[:: math.ceil(max(len(points), 1) / POINTS)]
-    few = table.take(slice(None, None, math.ceil(len(table) / NEIGHBOURS)))
-    for name in dict.fromkeys((table.axes.name, *TRIED)):
+    points = points[:: math.ceil(max(len(points), 1) / COMPARED_POINTS)]
+    few = table.take(slice(None, None, math.ceil(len(table) / MAX_COMPARED_SPLATS)))
+    for name in dict.fromkeys((table.axes.name, *TRIED_AXES)):
         means = in_scene(from_axes(few, name), scene.frame).means.numpy()
         found[name] = float(np.median(cKDTree(means).query(points)[0])) if len(points) else math.inf
     return found

@@ -14,7 +14,7 @@ from surfkit.core.registry import Component
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
-from surfkit.scene.scene import Cloud, Scene
+from surfkit.scene.scene import Scene, SparsePoints
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Start(Component):
         return InitialModel(primitive.init(self.cloud(known), generator))
 
     @abstractmethod
-    def cloud(self, known: StartInput) -> Cloud:
+    def cloud(self, known: StartInput) -> SparsePoints:
         """The points, the same for the same settings, data and state of the generator.
 
         Raises:

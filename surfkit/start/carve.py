@@ -17,25 +17,25 @@ from torch import Tensor
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
-MOST_VOXELS = 1 << 27
+MAX_GRID_VOXELS = 1 << 27
 """Voxels of a grid; those of a larger scene are made larger."""
-OUTLIERS = np.array([[0.03, 0.03, 0.002], [0.97, 0.97, 0.998]])
+GRID_QUANTILES = np.array([[0.03, 0.03, 0.002], [0.97, 0.97, 0.998]])
 """Shares of the points up to which the grid reaches along each axis: few views see the rim of a scene."""
-MARGIN = 8
+GRID_MARGIN_VOXELS = 8
 """Voxels around those points."""
-NEAR, BEYOND = 0.8, 1.6
+OWN_SURFACE_VOXELS, SEEN_THROUGH_VOXELS = 0.8, 1.6
 """Voxels around the middle of one in which a surface counts as its own, and behind it from which it is seen through."""
-ENOUGH, SURE = 2, 6
+MIN_SOLID_VIEWS, MIN_GROUND_VIEWS = 2, 6
 """Views that see a surface in a voxel, from which it is solid, and from which the ground may be there."""
-CELL, AROUND = 8, 5
+CELL_VOXELS, NEIGHBOURHOOD_CELLS = 8, 5
 """Voxels along a cell, of whose columns the lowest 5 % tell the ground, and cells around in which it is the lowest."""
-REACH = 2
+NORMAL_REACH_VOXELS = 2
 """Voxels around one that tell which way a surface faces, as in cpu/carve.cpp."""
 NOWHERE = 1 << 20
 
 
 @dataclass(frozen=True)
-class Grid:
+class CarvingGrid:
     """Voxels, the last of whose axes is up.
 
     Attributes:
@@ -51,18 +51,18 @@ class Grid:
     size: tuple[int, int, int]
 
     @classmethod
-    def around(cls, points: np.ndarray, axes: np.ndarray, side: float, most: int = MOST_VOXELS) -> Grid:
+    def around(cls, points: np.ndarray, axes: np.ndarray, side: float, most: int = MAX_GRID_VOXELS) -> CarvingGrid:
         """The grid that holds nearly all of (N, 3) points; with larger voxels where there would be more than `most`."""
         placed = points @ axes.T
-        low, high = np.stack([np.quantile(placed[:, i], OUTLIERS[:, i]) for i in range(3)], 1)
+        low, high = np.stack([np.quantile(placed[:, i], GRID_QUANTILES[:, i]) for i in range(3)], 1)
 
         def sizes(side: float) -> np.ndarray:
-            return np.ceil((high - low) / side).astype(np.int64) + 1 + 2 * MARGIN
+            return np.ceil((high - low) / side).astype(np.int64) + 1 + 2 * GRID_MARGIN_VOXELS
 
         while np.prod(sizes(side).astype(float)) > most:
             side *= 1.02
         size = tuple(int(n) for n in sizes(side))
-        return cls(axes.T @ (low - MARGIN * side), axes, side, (size[0], size[1], size[2]))
+        return cls(axes.T @ (low - GRID_MARGIN_VOXELS * side), axes, side, (size[0], size[1], size[2]))
 
     def voxels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(3, M) voxels that (M, 3) points lie in, or nearest to those outside; and (M,) bool, inside of the grid."""
@@ -90,7 +90,7 @@ class Votes:
     through: np.ndarray
 
 
-def votes(grid: Grid, maps: Iterable[tuple[Camera, Tensor]]) -> Votes:
+def votes(grid: CarvingGrid, maps: Iterable[tuple[Camera, Tensor]]) -> Votes:
     """What depth maps say of each voxel.
 
     Args:
@@ -105,12 +105,12 @@ def votes(grid: Grid, maps: Iterable[tuple[Camera, Tensor]]) -> Votes:
             vote(found, scaled, lens, pose)
         else:
             low, high = reach(grid, camera, pose, float(scaled.max(initial=0)))
-            way = [*pose.ravel().tolist(), NEAR, BEYOND]
+            way = [*pose.ravel().tolist(), OWN_SURFACE_VOXELS, SEEN_THROUGH_VOXELS]
             native.carve(found.surfaces, found.through, scaled, lens, way, low, high, torch.get_num_threads())
     return found
 
 
-def reach(grid: Grid, camera: Camera, pose: np.ndarray, depth: float) -> tuple[list[int], list[int]]:
+def reach(grid: CarvingGrid, camera: Camera, pose: np.ndarray, depth: float) -> tuple[list[int], list[int]]:
     """Columns that a camera may see up to a depth in voxels, along both axes on the ground: the first, and the end."""
     x, y = np.array([0, camera.width]), np.array([0, camera.height])
     rays = [[(a - camera.cx) / camera.fx, (b - camera.cy) / camera.fy, 1] for a in x for b in y]
@@ -132,10 +132,10 @@ def vote(found: Votes, depth: np.ndarray, lens: list[float], pose: np.ndarray) -
         at = [np.where(inside, value / np.where(inside, z, 1), 0).astype(int) for value in (v, u)]
         seen = depth[at[0].clip(0, height - 1), at[1].clip(0, width - 1)].astype(np.float64)
         known = inside & (seen > 0)
-        through = known & (seen > z + BEYOND)
+        through = known & (seen > z + SEEN_THROUGH_VOXELS)
         for counts, more in (
             (found.through[i], through),
-            (found.surfaces[i], known & (abs(seen - z) <= NEAR)),
+            (found.surfaces[i], known & (abs(seen - z) <= OWN_SURFACE_VOXELS)),
         ):
             counts += more & (counts < 255)
 
@@ -146,7 +146,7 @@ def solid_of(found: Votes) -> np.ndarray:
     solid = np.empty(found.surfaces.shape, np.uint8)
     for i, (surfaces, through) in enumerate(zip(found.surfaces, found.through, strict=True)):
         free = (through > 0) & (through > surfaces)
-        filled = (~free & (surfaces >= ENOUGH)) | (height < ground[i][:, None])
+        filled = (~free & (surfaces >= MIN_SOLID_VIEWS)) | (height < ground[i][:, None])
         nearest = np.where(free | filled, height, NOWHERE)  # known place at or above
         nearest = np.minimum.accumulate(nearest[:, ::-1], axis=1)[:, ::-1]
         rows = np.arange(len(free))[:, None]
@@ -160,18 +160,18 @@ def ground_of(found: Votes) -> np.ndarray:
 
     lowest = np.full(found.surfaces.shape[:2], NOWHERE)
     for i, (surfaces, through) in enumerate(zip(found.surfaces, found.through, strict=True)):
-        sure = (surfaces >= SURE) & (surfaces > through)
+        sure = (surfaces >= MIN_GROUND_VIEWS) & (surfaces > through)
         lowest[i] = np.where(sure.any(1), sure.argmax(1), NOWHERE)
-    over = [-n % CELL for n in lowest.shape]
+    over = [-n % CELL_VOXELS for n in lowest.shape]
     padded = np.pad(lowest, [(0, n) for n in over], mode="edge")
-    cells = padded.reshape(padded.shape[0] // CELL, CELL, -1, CELL).transpose(0, 2, 1, 3)
+    cells = padded.reshape(padded.shape[0] // CELL_VOXELS, CELL_VOXELS, -1, CELL_VOXELS).transpose(0, 2, 1, 3)
     low = np.percentile(cells.reshape(*cells.shape[:2], -1), 5, axis=2, method="lower")
-    low = minimum_filter(low, size=2 * AROUND + 1)
+    low = minimum_filter(low, size=2 * NEIGHBOURHOOD_CELLS + 1)
     low = gaussian_filter(np.where(low < NOWHERE, low, 0).astype(np.float64), 1.0)
-    return zoom(low, CELL, order=1, grid_mode=True, mode="nearest")[: lowest.shape[0], : lowest.shape[1]]
+    return zoom(low, CELL_VOXELS, order=1, grid_mode=True, mode="nearest")[: lowest.shape[0], : lowest.shape[1]]
 
 
-def meet(grid: Grid, solid: np.ndarray, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def meet(grid: CarvingGrid, solid: np.ndarray, camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where rays of a camera first meet a solid voxel.
 
     Args:
@@ -209,7 +209,7 @@ def march(solid: np.ndarray, start: np.ndarray, ways: np.ndarray, lengths: np.nd
         met = solid[tuple(at.T)] > 0
         lengths[on[met]] = t[on[met]]
         for ray, c in zip(on[met], at[met], strict=True):
-            low_c, high_c = (c - REACH).clip(0), np.minimum(c + REACH + 1, size)
+            low_c, high_c = (c - NORMAL_REACH_VOXELS).clip(0), np.minimum(c + NORMAL_REACH_VOXELS + 1, size)
             around = np.argwhere(solid[tuple(slice(a, b) for a, b in zip(low_c, high_c, strict=True))])
             outward[ray] = -(around + low_c - c).sum(0)
         on = on[~met]

@@ -14,19 +14,19 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.start.base import StartInput
-from surfkit.start.carve import Grid, Votes, meet, solid_of, votes
+from surfkit.start.carve import CarvingGrid, Votes, meet, solid_of, votes
 from surfkit.start.depth_points import points_of
-from surfkit.start.voxels import Collected, Samples, Thinned, thin
+from surfkit.start.voxels import Samples, Thinned, VoxelAccumulator, thin
 
-TRUSTED = 0.375
+MIN_SEEING_CONFIDENCE = 0.375
 """Least confidence of a depth that sees a surface, and through what lies before it."""
-VOXEL = 0.5
+VOXEL_SPACING_SHARE = 0.5
 """Side of a voxel, as a share of the distance between points."""
-PIXELS = 2
+MIN_UNTRUSTED_PIXELS = 2
 """Depth that is not trusted makes a point where so many pixels have it, of one view or more."""
-STEP = 2
+PIXEL_STRIDE = 2
 """Every second pixel of every second row looks for a surface that closes what is seen into."""
-APART = 0.75
+MIN_SPACING_SHARE = 0.75
 """Share of the distance between points from which another point is so near that none is needed."""
 
 
@@ -50,9 +50,9 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
         return Thinned.none()
     spacing = float(np.median(stereo.size))
     up = up_direction(None, known.scene.train, known.scene.frame, np.eye(4)).direction
-    grid = Grid.around(stereo.xyz, map_axes(up), VOXEL * spacing)
+    grid = CarvingGrid.around(stereo.xyz, map_axes(up), VOXEL_SPACING_SHARE * spacing)
     found = votes(grid, trusted_maps(known))
-    solid, side = solid_of(found), grid.side / VOXEL
+    solid, side = solid_of(found), grid.side / VOXEL_SPACING_SHARE
     if side > 1.01 * spacing:
         emit(
             Warned(
@@ -60,7 +60,7 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
                 "apart as elsewhere"
             )
         )
-    untrusted, closing = (Collected.for_points(side, most) for _ in range(2))
+    untrusted, closing = (VoxelAccumulator.for_points(side, most) for _ in range(2))
     for at, prior in enumerate(known.priors or ()):
         where = unsure(at)
         if where is not None and prior is not None and where.any():
@@ -71,8 +71,10 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
                 closing.add(seen_from(grid, solid, camera, where, photo))
         emit(Progress("points where no depth is trusted", at + 1, count))
     first, second = (thin(voxels, voxels.side) for voxels in (untrusted.settle(), closing.settle()))
-    first = first.take((first.weight >= PIXELS) & away_from(first.xyz, stereo.xyz, APART * side))
-    second = second.take(away_from(second.xyz, np.concatenate([stereo.xyz, first.xyz]), APART * side))
+    first = first.take(
+        (first.weight >= MIN_UNTRUSTED_PIXELS) & away_from(first.xyz, stereo.xyz, MIN_SPACING_SHARE * side)
+    )
+    second = second.take(away_from(second.xyz, np.concatenate([stereo.xyz, first.xyz]), MIN_SPACING_SHARE * side))
     return most_seen(first.joined(second), most)
 
 
@@ -93,7 +95,7 @@ def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
     """Cameras of the depth maps, and (H, W) depths, 0 where they are not trusted."""
     for at, prior in enumerate(known.priors or ()):
         if prior is not None:
-            there = (prior.inverse > 0) & (prior.confidence >= TRUSTED)
+            there = (prior.inverse > 0) & (prior.confidence >= MIN_SEEING_CONFIDENCE)
             if known.masks is not None and known.masks[at] is not None:
                 there &= known.masks[at]
             camera, (height, width) = known.scene.train[at].camera, prior.inverse.shape
@@ -101,7 +103,7 @@ def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
         emit(Progress("seeing through space", at + 1, len(known.priors or ())))
 
 
-def not_seen_through(grid: Grid, found: Votes, points: Samples) -> Samples:
+def not_seen_through(grid: CarvingGrid, found: Votes, points: Samples) -> Samples:
     """The points that no more trusted depth maps see through than see a surface there; a pixel has a weight of 1."""
     (i, j, k), inside = grid.voxels_of(points.xyz)
     keep = inside & (found.through[i, j, k] <= found.surfaces[i, j, k])
@@ -115,10 +117,10 @@ def not_seen_through(grid: Grid, found: Votes, points: Samples) -> Samples:
     )
 
 
-def seen_from(grid: Grid, solid: np.ndarray, camera: Camera, where: Tensor, photo: Tensor) -> Samples:
+def seen_from(grid: CarvingGrid, solid: np.ndarray, camera: Camera, where: Tensor, photo: Tensor) -> Samples:
     """What some of the pixels of a view meet in a grid, with their colours."""
     some = torch.zeros_like(where)
-    some[::STEP, ::STEP] = where[::STEP, ::STEP]
+    some[::PIXEL_STRIDE, ::PIXEL_STRIDE] = where[::PIXEL_STRIDE, ::PIXEL_STRIDE]
     rays = camera.rays(torch.float64)[:, some].T.numpy()
     depth, normals = meet(grid, solid, camera, rays)
     met = depth > 0
@@ -129,7 +131,7 @@ def seen_from(grid: Grid, solid: np.ndarray, camera: Camera, where: Tensor, phot
         xyz=((rays * depth[:, None] - shift) @ turn)[met],
         rgb=photo[:, some].T.float().numpy()[met],
         normals=facing[met],
-        weight=np.full(int(met.sum()), STEP**2, np.float32),
+        weight=np.full(int(met.sum()), PIXEL_STRIDE**2, np.float32),
         grain=np.full(int(met.sum()), grid.side),
     )
 

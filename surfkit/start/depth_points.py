@@ -10,7 +10,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.vectors import unit
 from surfkit.start.voxels import Samples
 
-EDGE = 0.02
+MAX_DEPTH_BEND = 0.02
 """Three inverse depths in a row that are bent by a larger share of the middle one do not lie on one surface."""
 
 
@@ -66,7 +66,7 @@ def normals_of(camera: Camera, inverse: Tensor) -> Tensor:
 def _slope(values: Tensor, dim: int) -> Tensor:
     """(H, W) change from a pixel to the next along an axis, NaN where it is not known or not that of one surface."""
     before, after = values.roll(1, dim), values.roll(-1, dim)
-    smooth = ((before + after) / 2 - values).abs() < EDGE * values
+    smooth = ((before + after) / 2 - values).abs() < MAX_DEPTH_BEND * values
     slope = torch.where(smooth & (before > 0) & (after > 0), (after - before) / 2, torch.nan)
     slope.index_fill_(dim, torch.tensor([0, values.shape[dim] - 1]), torch.nan)
     return slope

@@ -12,10 +12,10 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model, model_file, read_sound, warn_of_no_fit
-from surfkit.io.splats.table import THIN, SplatTable
+from surfkit.io.splats.table import SURFEL_SCALE_RATIO, SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
-from surfkit.scene.scene import Cloud, Scene
+from surfkit.scene.scene import Scene, SparsePoints
 from surfkit.start.axes import read_in_scene
 from surfkit.start.base import InitialModel, Start, StartInput
 
@@ -70,7 +70,7 @@ class SplatStart(Start):
         warn_of_no_fit(existing_model(self.file, "start.file"), table, known.scene)
         return InitialModel(primitive.from_table(table, generator), min(table.sh_degree, primitive.sh_degree))
 
-    def cloud(self, known: StartInput) -> Cloud:
+    def cloud(self, known: StartInput) -> SparsePoints:
         """See `Start.cloud`; only positions, colours, opacities and mean sizes."""
         return cloud_of(self._table(known.scene))
 
@@ -91,4 +91,4 @@ class SplatStart(Start):
 def is_thin(table: SplatTable) -> bool:
     """Whether most ellipsoids are flat: THIN times thinner along one axis than along the others."""
     ordered = table.log_scales.sort(1).values
-    return bool((ordered[:, 1] - ordered[:, 0]).median() >= math.log(THIN))
+    return bool((ordered[:, 1] - ordered[:, 0]).median() >= math.log(SURFEL_SCALE_RATIO))

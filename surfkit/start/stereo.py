@@ -14,14 +14,14 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.init import gaps
-from surfkit.scene.scene import Cloud, Scene
+from surfkit.scene.scene import Scene, SparsePoints
 from surfkit.scene.vectors import unit
 from surfkit.start.base import Start, StartInput
 from surfkit.start.closing import closing_points
 from surfkit.start.depth_points import focal, points_of
-from surfkit.start.voxels import NEIGHBOURS, Collected, Thinned, find_isolated, thin_to
+from surfkit.start.voxels import NOISE_NEIGHBOURS, Thinned, VoxelAccumulator, find_isolated, thin_to
 
-FILL = 2.0
+FILL_GAP_VOXELS = 2.0
 """A sparse point is used where no point of the depth maps lies within so many voxels."""
 SPARSE_OPACITY = 0.1
 """Of sparse points that fill gaps, as of a start from them alone."""
@@ -29,18 +29,18 @@ SPARSE_SIZE = 4.0
 """Their standard deviation, in distances between them. Most lie at the rim, where few or no photographs show more: what
 begins small is still small there after a thousand steps, and leaves black between. (On examples/boruszyn 1, 2, 4 and 8
 times: 21.3, 21.2, 21.8 and 21.4 dB, means of three seeds.)"""
-FEWER = 0.9
+MIN_POINT_SHARE = 0.9
 """A start with less than this share of the points that were asked for is told."""
-OVERLAP = 10
+PHOTOS_PER_PLACE = 10
 """How often a place is photographed, for a forecast; a rule of thumb for aerial surveys."""
-CLOSING = 0.6
+CLOSING_POINTS_SHARE = 0.6
 """Points where no depth is trusted, for each point of the depth maps, for a forecast: 0.55 in a city of alleys."""
 
-STEPS_EACH, LEAST_STEPS, MOST_STEPS = 30, 1_000, 30_000
+CPU_STEPS_PER_PHOTO, MIN_CPU_STEPS, MAX_CPU_STEPS = 30, 1_000, 30_000
 """Steps for each photograph, at least and at most, on a CPU. Measured with recipe:surface (docs/measured.md, "How many
 steps"): PSNR on boruszyn is flat from 25 steps a photograph on, on ochota it is 22.6, 23.4 and 24.0 dB with 11, 24 and
 55, and F1 on the synthetic Shibuya is flat from 13 on."""
-STEPS_ON_GPU, LEAST_STEPS_ON_GPU = 120, 4_000
+GPU_STEPS_PER_PHOTO, MIN_GPU_STEPS = 120, 4_000
 """The same on a GPU, where a step takes a hundredth of the time."""
 
 
@@ -101,8 +101,8 @@ class StereoStart(Start):
 
     def usual_steps(self, photographs: int, on_gpu: bool) -> int:
         """See `Start.usual_steps`."""
-        each, least = (STEPS_ON_GPU, LEAST_STEPS_ON_GPU) if on_gpu else (STEPS_EACH, LEAST_STEPS)
-        return min(max(each * photographs, least), MOST_STEPS)
+        each, least = (GPU_STEPS_PER_PHOTO, MIN_GPU_STEPS) if on_gpu else (CPU_STEPS_PER_PHOTO, MIN_CPU_STEPS)
+        return min(max(each * photographs, least), MAX_CPU_STEPS)
 
     @property
     def needs_prior(self) -> bool:
@@ -114,13 +114,13 @@ class StereoStart(Start):
         wanted = self.points if self.points == "auto" else min(self.points, points)
         return replace(self, points=wanted, most=min(self.most, points))
 
-    def cloud(self, known: StartInput) -> Cloud:
+    def cloud(self, known: StartInput) -> SparsePoints:
         """See `Start.cloud`."""
         stereo = self.fused(known)
         if not len(stereo):
             emit(Warned("no pixel of a depth map is trusted, so the run starts from the sparse points alone"))
             return known.scene.cloud
-        if self.points != "auto" and len(stereo) < FEWER * self.points:
+        if self.points != "auto" and len(stereo) < MIN_POINT_SHARE * self.points:
             emit(Warned(f"start.points is {self.points:,}, and the depth maps give {len(stereo):,}, a pixel apart"))
         return fill_gaps(stereo, self.closed(known, stereo), known, self)
 
@@ -135,7 +135,7 @@ class StereoStart(Start):
         """See `Start.expected`."""
         if self.points != "auto":
             return self.points
-        stereo = pixels / (OVERLAP * self.spacing_px**2) * (1 + CLOSING * (self.closing > 0))
+        stereo = pixels / (PHOTOS_PER_PLACE * self.spacing_px**2) * (1 + CLOSING_POINTS_SHARE * (self.closing > 0))
         return max(sparse, min(self.most, round(stereo)))
 
     def fused(self, known: StartInput) -> Thinned:
@@ -148,7 +148,7 @@ class StereoStart(Start):
             if prior is not None:
                 if collected is None:
                     side = unit * pixel_size(scene, prior)
-                    collected = Collected.for_points(side, wanted)
+                    collected = VoxelAccumulator.for_points(side, wanted)
                 with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
                     found = points_of(view.camera, prior, known.photos[at], self.trusted(known, at, prior))
                     collected.add(replace(found, grain=unit * found.grain))
@@ -157,7 +157,7 @@ class StereoStart(Start):
             return Thinned.none()
         voxels = collected.settle()
         rough = thin_to(voxels, wanted)
-        if wanted <= NEIGHBOURS:  # too few to tell which of them lie alone
+        if wanted <= NOISE_NEIGHBOURS:  # too few to tell which of them lie alone
             return rough
         noise = rough.take(find_isolated(rough))
         return thin_to(voxels.away_from(noise), wanted) if len(noise) else rough
@@ -183,18 +183,18 @@ def pixel_size(scene: Scene, prior: DepthPrior) -> float:
     return 1 / (prior.typical * float(np.median([focal(view.camera) for view in scene.train])))
 
 
-def fill_gaps(stereo: Thinned, closing: Thinned, known: StartInput, start: StereoStart) -> Cloud:
+def fill_gaps(stereo: Thinned, closing: Thinned, known: StartInput, start: StereoStart) -> SparsePoints:
     """Points of depth maps, those that close what these see into, and sparse points where maps have none."""
     from scipy.spatial import cKDTree
 
     sparse = known.scene.cloud
     distance, near = cKDTree(stereo.xyz).query(sparse.xyz.numpy())
-    more = torch.from_numpy(distance > FILL * stereo.size[near])
+    more = torch.from_numpy(distance > FILL_GAP_VOXELS * stereo.size[near])
     anyhow = torch.randn(int(more.sum()), 3, generator=known.generator)
     made = [(points, torch.from_numpy(points.xyz).float()) for points in (stereo, closing) if len(points)]
     colors = [torch.from_numpy(points.rgb.round().clip(0, 255)).to(torch.uint8) for points, _ in made]
     counts = torch.tensor([len(stereo), len(closing), len(anyhow)])
-    return Cloud(
+    return SparsePoints(
         xyz=torch.cat([*(xyz for _, xyz in made), sparse.xyz[more]]),
         rgb=torch.cat([*colors, sparse.rgb[more]]),
         normals=torch.cat([*(torch.from_numpy(points.normals).float() for points, _ in made), unit(anyhow, 1)]),

@@ -12,19 +12,19 @@ import numpy as np
 
 from surfkit.scene.sets import is_among
 
-BITS = 19
+VOXEL_INDEX_BITS = 19
 """Bits of the index of a voxel along each axis."""
-LEVELS = 31
+MAX_VOXEL_LEVELS = 31
 """Maximum number of voxel sizes."""
-BATCH = 1 << 19
+MIN_MERGED_VOXELS = 1 << 19
 """Minimum number of buffered voxels before they are merged into the sorted ones."""
-APART = 0.5
+DUPLICATE_VOXEL_SHARE = 0.5
 """Points closer to each other than this share of a voxel are duplicates, from voxels whose corners cut a surface."""
-LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
+MIN_KEPT_VOXELS, VOXELS_PER_POINT = 1 << 20, 6
 """Voxels kept while points are collected, at least, and for each point that may be made."""
-LONELY, NEIGHBOURS = 3.0, 3
+NOISE_RADIUS_VOXELS, NOISE_NEIGHBOURS = 3.0, 3
 """A point with fewer others within this many voxel sizes is noise."""
-WEIGHT, PLACE, COLOR, NORMAL = 0, slice(1, 4), slice(4, 7), slice(7, 10)
+WEIGHT_COLUMN, PLACE_COLUMNS, COLOR_COLUMNS, NORMAL_COLUMNS = 0, slice(1, 4), slice(4, 7), slice(7, 10)
 """Columns of the sums."""
 
 
@@ -105,18 +105,18 @@ class Voxels:
         level = np.round(np.log2(np.maximum(samples.grain / side, 1)))
         weight = samples.weight[:, None]
         sums = np.empty((len(weight), 10), np.float32)
-        sums[:, WEIGHT] = samples.weight
-        sums[:, PLACE], sums[:, COLOR] = weight * samples.xyz, weight * samples.rgb
-        sums[:, NORMAL] = weight * samples.normals
+        sums[:, WEIGHT_COLUMN] = samples.weight
+        sums[:, PLACE_COLUMNS], sums[:, COLOR_COLUMNS] = weight * samples.xyz, weight * samples.rgb
+        sums[:, NORMAL_COLUMNS] = weight * samples.normals
         return _summed(side, *_encoded(side, samples.xyz, level, sums))
 
     def level(self) -> np.ndarray:
         """(M,) of each voxel: its side is 2**level times the smallest."""
-        return self.keys >> (3 * BITS)
+        return self.keys >> (3 * VOXEL_INDEX_BITS)
 
     def means(self) -> np.ndarray:
         """(M, 3) float64 mean positions."""
-        return self.sums[:, PLACE].astype(np.float64) / self.sums[:, :1]
+        return self.sums[:, PLACE_COLUMNS].astype(np.float64) / self.sums[:, :1]
 
     def at(self, side: float) -> Voxels:
         """The same points in larger voxels, each at the mean of those that it had been averaged to."""
@@ -137,7 +137,7 @@ class Voxels:
         return self.without(distance < np.append(diagonal, 0.0)[near])
 
 
-class Collected:
+class VoxelAccumulator:
     """Voxels of all views so far; their size is doubled when there are too many."""
 
     def __init__(self, side: float, most: int) -> None:
@@ -146,14 +146,14 @@ class Collected:
         self.most, self.waiting = most, []
 
     @classmethod
-    def for_points(cls, side: float, points: int) -> Collected:
+    def for_points(cls, side: float, points: int) -> VoxelAccumulator:
         """Empty, with memory for as many voxels as so many points need."""
-        return cls(side, max(LEAST_VOXELS, VOXELS_A_POINT * points))
+        return cls(side, max(MIN_KEPT_VOXELS, VOXELS_PER_POINT * points))
 
     def add(self, samples: Samples) -> None:
         """Add the points of a view."""
         self.waiting.append(Voxels.of(self.voxels.side, samples))
-        if sum(map(len, self.waiting)) > max(len(self.voxels), BATCH):
+        if sum(map(len, self.waiting)) > max(len(self.voxels), MIN_MERGED_VOXELS):
             self.settle()
 
     def settle(self) -> Voxels:
@@ -173,14 +173,14 @@ def thin(voxels: Voxels, side: float) -> Thinned:
     found = found.without(_seen_finer(found))
     sums = found.sums.astype(np.float64)
     weight = sums[:, :1]
-    length = np.linalg.norm(sums[:, NORMAL], axis=1, keepdims=True)
-    normals = np.where(length > 1e-6 * weight, sums[:, NORMAL] / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
+    length = np.linalg.norm(sums[:, NORMAL_COLUMNS], axis=1, keepdims=True)
+    normals = np.where(length > 1e-6 * weight, sums[:, NORMAL_COLUMNS] / np.maximum(length, 1e-30), (0.0, 0.0, 1.0))
     size = side * 2.0 ** found.level()
-    points = Thinned(sums[:, PLACE] / weight, sums[:, COLOR] / weight, normals, weight[:, 0], size)
+    points = Thinned(sums[:, PLACE_COLUMNS] / weight, sums[:, COLOR_COLUMNS] / weight, normals, weight[:, 0], size)
     keep = np.ones(len(points), bool)
     for each in np.unique(size):
         rows = np.flatnonzero(size == each)
-        keep[rows] = apart(points.xyz[rows], points.weight[rows], APART * each)
+        keep[rows] = apart(points.xyz[rows], points.weight[rows], DUPLICATE_VOXEL_SHARE * each)
     return points.take(keep)
 
 
@@ -231,10 +231,10 @@ def find_isolated(points: Thinned) -> np.ndarray:
     """(P,) which points have too few others near them to be a surface."""
     from scipy.spatial import cKDTree
 
-    if len(points) <= NEIGHBOURS:
+    if len(points) <= NOISE_NEIGHBOURS:
         return np.ones(len(points), bool)
-    distances, _ = cKDTree(points.xyz).query(points.xyz, k=NEIGHBOURS + 1)
-    return distances[:, -1] > LONELY * points.size
+    distances, _ = cKDTree(points.xyz).query(points.xyz, k=NOISE_NEIGHBOURS + 1)
+    return distances[:, -1] > NOISE_RADIUS_VOXELS * points.size
 
 
 def _seen_finer(voxels: Voxels) -> np.ndarray:
@@ -253,13 +253,15 @@ def _encoded(side: float, xyz: np.ndarray, level: np.ndarray, values: np.ndarray
 
     A voxel is larger than asked for where its index would be too large.
     """
-    half = 1 << (BITS - 1)
+    half = 1 << (VOXEL_INDEX_BITS - 1)
     reach = np.abs(xyz).max(axis=1, initial=0) / (side * (half - 1))
     level = np.maximum(level, np.ceil(np.log2(np.maximum(reach, 1)))).astype(np.int64)
-    there = level <= LEVELS
+    there = level <= MAX_VOXEL_LEVELS
     level, xyz, values = level[there], xyz[there], values[there]
     index = np.floor(xyz / (side * 2.0 ** level[:, None])).astype(np.int64) + half
-    return ((level << BITS | index[:, 0]) << BITS | index[:, 1]) << BITS | index[:, 2], values
+    return ((level << VOXEL_INDEX_BITS | index[:, 0]) << VOXEL_INDEX_BITS | index[:, 1]) << VOXEL_INDEX_BITS | index[
+        :, 2
+    ], values
 
 
 def _summed(side: float, keys: np.ndarray, sums: np.ndarray) -> Voxels:

@@ -13,7 +13,7 @@ from surfkit.core.schedule import rescale
 from surfkit.core.tree import evolve
 from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe, unused, without_unused
-from surfkit.study.columns import COLUMNS
+from surfkit.study.columns import TABLE_COLUMNS
 
 BASELINE = "Without splats"
 """Group of the rows that come last in a table, below those that packages add to it."""
@@ -47,8 +47,8 @@ class Row:
             if len(text.splitlines()) > 1:
                 raise BadInput(f"row {self.label!r}: label and group are one line each")
         for name in self.paper:
-            if name not in COLUMNS:
-                raise BadInput(f"row {self.label!r}, paper: {unknown('column', name, COLUMNS)}")
+            if name not in TABLE_COLUMNS:
+                raise BadInput(f"row {self.label!r}, paper: {unknown('column', name, TABLE_COLUMNS)}")
 
     @property
     def is_given_up(self) -> bool:
@@ -76,8 +76,8 @@ class Table:
 
     def __post_init__(self) -> None:
         for name in self.columns:
-            if name not in COLUMNS:
-                raise BadInput(f"table:{self.name}, columns: {unknown('column', name, COLUMNS)}")
+            if name not in TABLE_COLUMNS:
+                raise BadInput(f"table:{self.name}, columns: {unknown('column', name, TABLE_COLUMNS)}")
         labels = [row.label for row in self.rows]
         if twice := [label for label in labels if labels.count(label) > 1]:
             raise BadInput(f"table:{self.name} has two rows {twice[0]!r}; each needs a label of its own")

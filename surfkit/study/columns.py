@@ -14,7 +14,7 @@ THOUSANDS = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
 @dataclass(frozen=True)
-class Column:
+class MetricColumn:
     """One measurement.
 
     Attributes:
@@ -61,35 +61,35 @@ class Column:
         return 1.0, self.unit, 0
 
 
-COLUMNS = {
-    "ssim": Column("SSIM", 3, "higher"),
-    "psnr": Column("PSNR", 2, "higher"),
-    "lpips": Column("LPIPS", 3, "lower", by_default=False),
-    "precision": Column("P", 3, "higher"),
-    "recall": Column("R", 3, "higher"),
-    "f1": Column("F1", 3, "higher"),
-    "normals_median": Column("normals", 1, "lower", unit="deg", by_default=False),
-    "normals_p90": Column("normals 90 %", 1, "lower", unit="deg", by_default=False),
-    "roughness_on_truth": Column("rough", 3, "lower", by_default=False),
-    "roughness": Column("rough, own planes", 3, "lower", by_default=False),
-    "boundary_share": Column("boundary", 2, "lower", factor=100, unit="%", by_default=False),
-    "components": Column("parts", 0, "lower", by_default=False),
-    "non_manifold_edges": Column("non-manifold", 0, "lower", by_default=False),
-    "crossing_share": Column("crossing", 3, "lower", factor=100, unit="%", by_default=False),
-    "triangles": Column("triangles", 2, "lower", scaled=True, in_percent=True, by_default=False),
-    "triangles_per_area": Column("per area", 1, "lower", in_percent=True, by_default=False),
-    "points": Column("points", 2, "lower", scaled=True, in_percent=True),
-    "seconds": Column("minutes", 1, "lower", factor=1 / 60, in_percent=True),
-    "cpu_seconds": Column("CPU min", 1, "lower", factor=1 / 60, in_percent=True),
-    "bytes": Column("size", 2, "lower", unit="B", scaled=True, in_percent=True),
-    "peak_memory_bytes": Column("memory", 2, "lower", unit="B", scaled=True, in_percent=True),
-    "peak_gpu_bytes": Column("GPU memory", 2, "lower", unit="B", scaled=True, in_percent=True),
-    "fps": Column("FPS", 1, "higher", in_percent=True),
+TABLE_COLUMNS = {
+    "ssim": MetricColumn("SSIM", 3, "higher"),
+    "psnr": MetricColumn("PSNR", 2, "higher"),
+    "lpips": MetricColumn("LPIPS", 3, "lower", by_default=False),
+    "precision": MetricColumn("P", 3, "higher"),
+    "recall": MetricColumn("R", 3, "higher"),
+    "f1": MetricColumn("F1", 3, "higher"),
+    "normals_median": MetricColumn("normals", 1, "lower", unit="deg", by_default=False),
+    "normals_p90": MetricColumn("normals 90 %", 1, "lower", unit="deg", by_default=False),
+    "roughness_on_truth": MetricColumn("rough", 3, "lower", by_default=False),
+    "roughness": MetricColumn("rough, own planes", 3, "lower", by_default=False),
+    "boundary_share": MetricColumn("boundary", 2, "lower", factor=100, unit="%", by_default=False),
+    "components": MetricColumn("parts", 0, "lower", by_default=False),
+    "non_manifold_edges": MetricColumn("non-manifold", 0, "lower", by_default=False),
+    "crossing_share": MetricColumn("crossing", 3, "lower", factor=100, unit="%", by_default=False),
+    "triangles": MetricColumn("triangles", 2, "lower", scaled=True, in_percent=True, by_default=False),
+    "triangles_per_area": MetricColumn("per area", 1, "lower", in_percent=True, by_default=False),
+    "points": MetricColumn("points", 2, "lower", scaled=True, in_percent=True),
+    "seconds": MetricColumn("minutes", 1, "lower", factor=1 / 60, in_percent=True),
+    "cpu_seconds": MetricColumn("CPU min", 1, "lower", factor=1 / 60, in_percent=True),
+    "bytes": MetricColumn("size", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "peak_memory_bytes": MetricColumn("memory", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "peak_gpu_bytes": MetricColumn("GPU memory", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "fps": MetricColumn("FPS", 1, "higher", in_percent=True),
 }
 """Every column by its name in ablation.json and on the command line, in the order of the paper's tables."""
 
 
-OF_MESH = (
+MESH_COLUMNS = (
     "normals_median",
     "normals_p90",
     "roughness_on_truth",
@@ -107,8 +107,8 @@ OF_MESH = (
 def refuse_unknown_columns(names: Sequence[str]) -> None:
     """BadInput for a name that no column has, or that stands twice."""
     for at, name in enumerate(names):
-        if name not in COLUMNS:
-            raise BadInput(f"--columns: {unknown('column', name, COLUMNS)}")
+        if name not in TABLE_COLUMNS:
+            raise BadInput(f"--columns: {unknown('column', name, TABLE_COLUMNS)}")
         if name in names[:at]:
             raise BadInput(f"--columns: {name} is there twice; name each column once")
 
@@ -123,5 +123,5 @@ def shown_columns(asked: Sequence[str], measured: Collection[str], also: Collect
     """
     if asked:
         return list(asked)
-    found = [name for name, column in COLUMNS.items() if (column.by_default or name in also) and name in measured]
+    found = [name for name, column in TABLE_COLUMNS.items() if (column.by_default or name in also) and name in measured]
     return found or ["ssim", "psnr", "points"]

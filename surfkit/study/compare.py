@@ -10,12 +10,12 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.study.ablation import Row, Table, built_on
-from surfkit.study.columns import COLUMNS
+from surfkit.study.columns import TABLE_COLUMNS
 
-OF_MESH = ("triangles", "triangles_per_area", "boundary_share", "components", "non_manifold_edges")
+MESH_METRICS = ("triangles", "triangles_per_area", "boundary_share", "components", "non_manifold_edges")
 """What stands in metrics.json under "mesh" by the name of its column."""
 Figures = Mapping[str, float]
-"""Numbers of a run, by the names in `COLUMNS`."""
+"""Numbers of a run, by the names in `TABLE_COLUMNS`."""
 
 
 def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, float]:
@@ -50,7 +50,7 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
     known["lpips"] = images.get("lpips_alex")  # AlexNet, as in CityGaussianV2's released code
     needed = {"seconds", "cpu_seconds"} | (set() if "not_measured" in images else {"psnr", "ssim"})
     needed |= set() if "points" in known and known["points"] is None else {"points"}
-    wanted = [name for name in COLUMNS if name in needed or known.get(name) is not None]
+    wanted = [name for name in TABLE_COLUMNS if name in needed or known.get(name) is not None]
     found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
     made = load(float, metrics.get("prepare_cpu_seconds") or 0.0, "prepare_cpu_seconds")
     return found | {"cpu_seconds": found["cpu_seconds"] + made}
@@ -74,7 +74,7 @@ def surface_figures(geometry: Mapping[str, Any], mesh: Mapping[str, Any]) -> dic
         **{name: geometry.get(name) for name in ("precision", "recall", "f1")},
         **{f"normals_{name}": part(geometry, "normals").get(name) for name in ("median", "p90")},
         "roughness_on_truth": part(geometry, "roughness").get("on_truth_planes"),
-        **{name: mesh.get(name) for name in OF_MESH},
+        **{name: mesh.get(name) for name in MESH_METRICS},
         "crossing_share": part(mesh, "crossing").get("share"),
         "roughness": part(mesh, "roughness").get("on_planes"),
     }
@@ -137,7 +137,7 @@ def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dic
 
 def _known(runs: Collection[Figures]) -> list[str]:
     """Names that all of some runs have a number for."""
-    return [name for name in COLUMNS if runs and all(name in run for run in runs)]
+    return [name for name in TABLE_COLUMNS if runs and all(name in run for run in runs)]
 
 
 def deviation(values: list[float]) -> float | None:

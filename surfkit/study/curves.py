@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.chart import Line
+from surfkit.evaluate.geometry.chart import PlotLine
 from surfkit.runs import journal
 
 What = Literal["points", "loss", "memory"]
@@ -18,7 +18,7 @@ DOTS = 300
 
 
 @dataclass(frozen=True)
-class Place:
+class StageRef:
     """A part of a run whose steps are counted on their own.
 
     Attributes:
@@ -44,7 +44,7 @@ class Place:
         return found[self.index]
 
 
-def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray, np.ndarray]:
+def curve(out: Path, what: What, place: StageRef | None = None) -> tuple[np.ndarray, np.ndarray]:
     """(T,) steps and (T,) numbers of a run: of its first stage, or of one of its parts. Memory in GB.
 
     Raises:
@@ -53,13 +53,13 @@ def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray
     if not (out / "recipe.json").exists():
         raise BadInput(f"{out}: no run folder (no recipe.json in it); name one that surfkit train made")
     folder = out if place is None else place.folder(out)
-    done = [line for line in journal.read(folder / journal.NAME) if line["event"] == "StepDone"]
+    done = [line for line in journal.read(folder / journal.JOURNAL_FILE) if line["event"] == "StepDone"]
     try:
         rows = np.array([(line["index"], _number(line, what)) for line in done], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{folder / journal.NAME}: a step without its {what}; the file is damaged") from error
+        raise BadInput(f"{folder / journal.JOURNAL_FILE}: a step without its {what}; the file is damaged") from error
     if not len(rows):
-        raise BadInput(f"{folder / journal.NAME}: no step is made yet, or the method of the run makes none")
+        raise BadInput(f"{folder / journal.JOURNAL_FILE}: no step is made yet, or the method of the run makes none")
     if what == "points" and not rows[:, 1].any():
         raise BadInput(f"{out}: the method of the run has no points; draw --of loss")
     return thinned(rows)
@@ -72,14 +72,14 @@ def thinned(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return steps, values
 
 
-def lines(outs: tuple[Path, ...], what: What, place: Place | None = None) -> list[Line]:
+def lines(outs: tuple[Path, ...], what: What, place: StageRef | None = None) -> list[PlotLine]:
     """A line for each run, named after its folder."""
     if not outs:
         raise BadInput("curves: name one or more run folders")
     found = []
     for out in outs:
         steps, values = curve(out, what, place)
-        found.append(Line(out.resolve().name, steps, values))
+        found.append(PlotLine(out.resolve().name, steps, values))
     return found
 
 

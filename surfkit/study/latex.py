@@ -6,9 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from surfkit.study.columns import COLUMNS
+from surfkit.study.columns import TABLE_COLUMNS
 from surfkit.study.table import (
-    Cell,
+    FormattedNumber,
     blanks,
     caption,
     columns_of,
@@ -19,7 +19,7 @@ from surfkit.study.table import (
 )
 from surfkit.study.table import published_cells as published
 
-PACKAGES = r"% In the preamble: \usepackage{adjustbox,booktabs} and \usepackage[table]{xcolor}"
+PREAMBLE_NOTE = r"% In the preamble: \usepackage{adjustbox,booktabs} and \usepackage[table]{xcolor}"
 GREEK = """
 alpha beta gamma delta varepsilon eta theta kappa lambda mu pi rho sigma tau varphi omega Delta Sigma Omega
 """
@@ -73,7 +73,7 @@ def latex(report: Mapping[str, Any]) -> str:
         body.append(grey + " & ".join([escape(row["label"]) + mark, *cells]) + r" \\")
     return "\n".join(
         [
-            PACKAGES,
+            PREAMBLE_NOTE,
             r"\begin{table}[t]",
             r"\centering",
             rf"\caption{{{escape(caption(report))}}}",
@@ -101,11 +101,15 @@ def _heads(groups: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
         titles.append(rf"\multicolumn{{{len(columns)}}}{{c}}{{{escape(title)}}}")
         rules.append(rf"\cmidrule(lr){{{at}-{at + len(columns) - 1}}}")
         at += len(columns)
-    heads = [escape(COLUMNS[name].head) + ARROWS[COLUMNS[name].better] for _, columns in groups for name in columns]
+    heads = [
+        escape(TABLE_COLUMNS[name].head) + ARROWS[TABLE_COLUMNS[name].better]
+        for _, columns in groups
+        for name in columns
+    ]
     upper = [" & ".join(["", *titles]) + r" \\", " ".join(rules)] if len(groups) > 1 else []
     return [*upper, " & ".join(["", *heads]) + r" \\"]
 
 
-def _cell(cell: Cell) -> str:
+def _cell(cell: FormattedNumber) -> str:
     text = re.sub(r" (\w?B|[MG])$", r"\\,\1", escape(cell.value))
     return rf"\textbf{{{text}}}" if cell.best else text

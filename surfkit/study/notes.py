@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
-from surfkit.io.datasets.depth_prior import OFF, prepare_command, prior_files
+from surfkit.io.datasets.depth_prior import SWITCHED_OFF, prepare_command, prior_files
 from surfkit.io.datasets.read import read
 from surfkit.runs.folder import Run, read_record
 from surfkit.study.rows import Trial
@@ -27,7 +27,7 @@ def lines_on_depth(trials: Sequence[Trial], labels: Sequence[str]) -> list[str]:
         fail = {each.label for each in wanting if each.recipe.method.needs_prior or each.recipe.start.needs_prior}
         begin = f"; {row_numbers(fail, labels)} will fail, as training begins at depth maps" if fail else ""
         make = prepare_command(data)
-        found.append(f"{data.path} has no depth priors, so {OFF}, in {rows}{begin}; {make}")
+        found.append(f"{data.path} has no depth priors, so {SWITCHED_OFF}, in {rows}{begin}; {make}")
     return found
 
 
@@ -37,7 +37,7 @@ def _wants_maps(trial: Trial) -> bool:
 
 def lacked_maps(trial: Trial) -> bool:
     """Whether a run was to learn from depth maps, and had none, so that it is not what its row is named after."""
-    return _wants_maps(trial) and any(OFF in note for note in read_record(trial.folder).get("notes", []))
+    return _wants_maps(trial) and any(SWITCHED_OFF in note for note in read_record(trial.folder).get("notes", []))
 
 
 def notes_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:

@@ -16,10 +16,10 @@ from surfkit.io.datasets.read import read
 from surfkit.runs.folder import note_metrics
 from surfkit.study.ablation import Row, Table
 from surfkit.study.compare import compared, surface_figures
-from surfkit.study.rows import Outcome
+from surfkit.study.rows import TrialResult
 from surfkit.study.truth import Truth
 
-FOLDER = "meshes"
+MESHES_FOLDER = "meshes"
 """In that of a table: what was measured of meshes of other programs."""
 GROUP = "Other programs"
 """Heading of the part of a table that has them."""
@@ -58,7 +58,7 @@ class OtherMesh:
         """Where its measurements are kept; of another file, or of another truth, they lie elsewhere."""
         state = self.path.stat()
         made = f"{self.path.resolve()} {state.st_size} {state.st_mtime_ns} {truth.path} {truth.tau} {truth.stamp}"
-        return out / FOLDER / hashlib.sha256(made.encode()).hexdigest()[:12]
+        return out / MESHES_FOLDER / hashlib.sha256(made.encode()).hexdigest()[:12]
 
     def measure(self, truth: Truth, data: Data, out: Path) -> None:
         """Compare it with the truth as the meshes of all rows are, in the same volume, and keep what came out.
@@ -79,14 +79,14 @@ class OtherMesh:
         return {name: float(value) for name, value in found.items() if value is not None}
 
 
-def measured_mesh(mesh: OtherMesh, truth: Truth, data: Data, out: Path) -> Outcome:
+def measured_mesh(mesh: OtherMesh, truth: Truth, data: Data, out: Path) -> TrialResult:
     """The numbers of a mesh, which is measured if it was not yet, or why it could not be."""
     try:
         if mesh.figures(truth, out) is None:
             mesh.measure(truth, data, out)
-        return Outcome(mesh.figures(truth, out))
+        return TrialResult(mesh.figures(truth, out))
     except BadInput as error:
-        return Outcome(failed=" ".join(str(error).split()))
+        return TrialResult(failed=" ".join(str(error).split()))
 
 
 def refuse_unfit(meshes: Sequence[OtherMesh], table: Table, data_sets: int, has_truth: bool) -> None:
@@ -105,7 +105,7 @@ def refuse_unfit(meshes: Sequence[OtherMesh], table: Table, data_sets: int, has_
 
 
 def mesh_rows(
-    meshes: Sequence[OtherMesh], truth: Truth, out: Path, outcomes: Mapping[Path, Outcome], before: int
+    meshes: Sequence[OtherMesh], truth: Truth, out: Path, outcomes: Mapping[Path, TrialResult], before: int
 ) -> list[dict[str, Any]]:
     """Plain data of the rows of meshes, as those of a table are.
 
@@ -127,7 +127,7 @@ def mesh_rows(
                 "runs": []
                 if found is None
                 else [{"seed": None, "folder": folder.relative_to(out).as_posix(), **found}],
-                "failed": outcomes.get(folder, Outcome()).failed,
+                "failed": outcomes.get(folder, TrialResult()).failed,
                 "not_as_named": None,
                 "file": str(mesh.path),
             }

@@ -9,7 +9,7 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.evaluate.images.lpips import SMALLEST_PX, NoWeights, load_perceptual
+from surfkit.evaluate.images.lpips import MIN_SIDE_PX, NoWeights, load_perceptual
 from surfkit.evaluate.images.measure import lpips_names, lpips_values
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.raster.select import Device
@@ -25,8 +25,8 @@ NET = "alex"
 
 def refuse_unmeasurable(views: Sequence[View]) -> None:
     """BadInput if LPIPS cannot be measured on some photographs."""
-    if min(min(view.camera.width, view.camera.height) for view in views) < SMALLEST_PX:
-        raise BadInput(f"--columns lpips: a photograph has a side of less than {SMALLEST_PX} pixels; leave lpips out")
+    if min(min(view.camera.width, view.camera.height) for view in views) < MIN_SIDE_PX:
+        raise BadInput(f"--columns lpips: a photograph has a side of less than {MIN_SIDE_PX} pixels; leave lpips out")
     try:
         load_perceptual(NET)
     except NoWeights as error:

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.parts import by_seams, by_views, measure_parts
 from surfkit.evaluate.images.seams import Seams
-from surfkit.evaluate.images.view_counts import Depths, ViewCounts, count_views
+from surfkit.evaluate.images.view_counts import DepthSource, ViewCounts, count_views
 from surfkit.io.datasets.masks import view_mask
 from surfkit.mesh.depths import mesh_depth
 from surfkit.mesh.picture import depth_of
@@ -26,15 +26,15 @@ from surfkit.runs.folder import Run
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, Scene, View
 
-SEAM = 0.02
+AUTO_SEAM_SHARE = 0.02
 """Automatic distance from a border, as a share of the width of the scene: twice its extent."""
-STEPS = 40
+PLACES_PER_REACH = 40
 """Places along a border, for each distance from it that counts as near: far more than a circle of it needs."""
-SHORTEST = 1e-3
+MIN_BORDER_DISTANCE = 1e-3
 """Distance from a border that can be told, in extents."""
-ROOM = 8.0
+BORDER_REACH_EXTENTS = 8.0
 """Extents around the middle of the scene in which borders are looked at: surfaces lie within."""
-RENDERED = 0.01
+RENDERED_DEPTH_TOLERANCE = 0.01
 """Share of the depth within which rendered depths agree."""
 
 Distance = float | Literal["auto"]
@@ -81,7 +81,7 @@ def seams_of(run: Run, frame: Frame, distance: Distance) -> Seams:
     if cells.count < 2:
         raise BadInput(f"--seams: {path} has one block, and so no borders; leave --seams out")
     if distance == "auto":
-        reach = 2 * SEAM
+        reach = 2 * AUTO_SEAM_SHARE
     elif frame.local_metres is None:
         raise BadInput(
             f"--seams {distance:g}: metres cannot be used, as the data set does not say how long its unit is; give "
@@ -89,16 +89,20 @@ def seams_of(run: Run, frame: Frame, distance: Distance) -> Seams:
         )
     else:
         reach = distance / frame.local_metres
-    if reach < SHORTEST:
-        raise BadInput(f"--seams {distance:g}: less than {SHORTEST:g} of the extent of the scene; give more, or auto")
+    if reach < MIN_BORDER_DISTANCE:
+        raise BadInput(
+            f"--seams {distance:g}: less than {MIN_BORDER_DISTANCE:g} of the extent of the scene; give more, or auto"
+        )
     middle = np.zeros(2)  # of the training cameras
-    borders = border_places(cells, middle - ROOM, middle + ROOM, reach / STEPS)
+    borders = border_places(
+        cells, middle - BORDER_REACH_EXTENTS, middle + BORDER_REACH_EXTENTS, reach / PLACES_PER_REACH
+    )
     metres = frame.local_metres
     told = f"{reach / frame.scale:.3g} units" if metres is None else f"{reach * metres:.3g} m"
     return Seams(borders, np.array([cells.ground.x, cells.ground.y]), reach, told)
 
 
-def rendered_depths(draw: Draw) -> Depths:
+def rendered_depths(draw: Draw) -> DepthSource:
     """Depth that the model itself has: the median depth where the primitive has one, else the expected depth."""
 
     def of(view: View) -> Tensor:
@@ -109,10 +113,10 @@ def rendered_depths(draw: Draw) -> Depths:
             )
         return depth_of(maps, "expected" if maps.median is None else "median").cpu()
 
-    return Depths(of, "rendered depth", RENDERED, through=False)
+    return DepthSource(of, "rendered depth", RENDERED_DEPTH_TOLERANCE, through=False)
 
 
-def true_depths(truth: Surface, frame: Frame, matrix: Sequence[Sequence[float]]) -> Depths:
+def true_depths(truth: SurfaceFile, frame: Frame, matrix: Sequence[Sequence[float]]) -> DepthSource:
     """Depth of the true mesh.
 
     Args:
@@ -124,10 +128,12 @@ def true_depths(truth: Surface, frame: Frame, matrix: Sequence[Sequence[float]])
     finite = np.isfinite(vertices).all(1)
     vertices[~finite] = 0.0  # no face is at these
     faces = np.asarray(truth.faces)
-    return Depths(lambda view: torch.from_numpy(mesh_depth(vertices, faces, view.camera)), "truth", 0.0, through=True)
+    return DepthSource(
+        lambda view: torch.from_numpy(mesh_depth(vertices, faces, view.camera)), "truth", 0.0, through=True
+    )
 
 
-def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: Depths, seams: Seams | None) -> dict[str, Any]:
+def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: DepthSource, seams: Seams | None) -> dict[str, Any]:
     """Figures for metrics.json, to stand among those of the images: "seen" and "seams", as far as they are asked for.
 
     Args:

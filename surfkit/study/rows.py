@@ -22,20 +22,20 @@ from surfkit.core.signals import terminable
 from surfkit.io.datasets.data import Data
 from surfkit.raster.select import Device
 from surfkit.runs import pipeline
-from surfkit.runs.blocks.schedule import LEAVE_S, Compute
+from surfkit.runs.blocks.schedule import WORKER_EXIT_S, Compute
 from surfkit.runs.execute.base import LOG, Executor, Job, JobResult
-from surfkit.runs.execute.remote import DRIVER, INTERRUPTED, POLL_S
+from surfkit.runs.execute.remote import CHILD_POLL_S, DRIVER, INTERRUPTED_STATUS
 from surfkit.runs.notes import collect_notes
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.store import StageStore
+from surfkit.runs.store import StageCache
 from surfkit.study.compare import figures
 from surfkit.study.perceptual import measure_lpips
 from surfkit.study.truth import Truth
 from surfkit.train.data_cache import CacheSettings
 
-TRACE = "failed.txt"
+TRACEBACK_FILE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""
-WORK, OUTCOME = "row.json", "outcome.json"
+ROW_FILE, OUTCOME_FILE = "row.json", "outcome.json"
 """In the folder of a run that another process makes: what it is to do, and what came out."""
 
 
@@ -56,7 +56,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Work:
+class TrialJob:
     """All that a process needs to know to run a trial.
 
     Attributes:
@@ -77,7 +77,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialResult:
     """What a run came to: numbers, the reason in one line why it failed, or both where only its mesh did."""
 
     figures: dict[str, int | float] | None = None
@@ -99,36 +99,36 @@ def finished(trial: Trial) -> dict[str, int | float] | None:
         raise BadInput(f"{path}: {error}; delete it, and the row is measured again") from error
 
 
-def attempt(work: Work) -> Outcome:
+def attempt(work: TrialJob) -> TrialResult:
     """Run one recipe, or go on with it; what goes wrong becomes its outcome."""
     trial = work.trial
-    trace, found = trial.folder / TRACE, finished(trial)
+    trace, found = trial.folder / TRACEBACK_FILE, finished(trial)
     try:
         if found is None:
             found = figures(train(work), trial.recipe.compress is not None)
         with collect_notes():
             found = measured(work, found)
     except (BadInput, Fault) as error:
-        return Outcome(found, " ".join(str(error).split()))
+        return TrialResult(found, " ".join(str(error).split()))
     except Exception as error:
         write_text(trace, traceback.format_exc())
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return Outcome(found, f"{reason[:200]}; see {trace}")
+        return TrialResult(found, f"{reason[:200]}; see {trace}")
     trace.unlink(missing_ok=True)
-    return Outcome(found)
+    return TrialResult(found)
 
 
-def train(work: Work) -> dict[str, Any]:
+def train(work: TrialJob) -> dict[str, Any]:
     """The metrics of a run, which is made or gone on with."""
     trial = work.trial
     await_worker(trial.folder)
-    store = None if work.store is None else StageStore(work.store)
+    store = None if work.store is None else StageCache(work.store)
     gc.collect()  # else what the row before has left would count as memory of this one
     compute, caches = Compute(work.device), CacheSettings(work.cache)
     return pipeline.run(trial.recipe, trial.data, trial.folder, compute, caches=caches, store=store)
 
 
-def measured(work: Work, found: dict[str, int | float]) -> dict[str, int | float]:
+def measured(work: TrialJob, found: dict[str, int | float]) -> dict[str, int | float]:
     """The numbers of a finished run, with F1 and LPIPS where they are wanted."""
     trial, compressed = work.trial, work.trial.recipe.compress is not None
     if trial.truth is not None and "f1" not in found:
@@ -141,12 +141,12 @@ def measured(work: Work, found: dict[str, int | float]) -> dict[str, int | float
 
 def await_worker(folder: Path) -> None:
     """Wait for a worker of an earlier command, which ends when it notices that its driver is gone."""
-    until = time.monotonic() + LEAVE_S
+    until = time.monotonic() + WORKER_EXIT_S
     while lock_holder(folder) and time.monotonic() < until:
-        time.sleep(POLL_S)
+        time.sleep(CHILD_POLL_S)
 
 
-def run_elsewhere(works: Sequence[Work], workers: Executor) -> Iterator[tuple[Work, Outcome]]:
+def run_elsewhere(works: Sequence[TrialJob], workers: Executor) -> Iterator[tuple[TrialJob, TrialResult]]:
     """Each of some rows with its outcome, in the order in which they end.
 
     Raises:
@@ -160,34 +160,34 @@ def run_elsewhere(works: Sequence[Work], workers: Executor) -> Iterator[tuple[Wo
             yield work, outcome_of(work, result)
 
 
-def job_of(at: int, work: Work) -> Job:
+def job_of(at: int, work: TrialJob) -> Job:
     """The job that runs a row in a process of its own; what it is to do is written into the folder of its run."""
     folder, recipe = work.trial.folder.resolve(), work.trial.recipe
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / OUTCOME).unlink(missing_ok=True)
+    (folder / OUTCOME_FILE).unlink(missing_ok=True)
     own = replace(work, trial=replace(work.trial, folder=folder), out=work.out.resolve())
-    write_json(folder / WORK, own if own.store is None else replace(own, store=own.store.resolve()))
+    write_json(folder / ROW_FILE, own if own.store is None else replace(own, store=own.store.resolve()))
     return Job(
         index=at,
         folder=folder,
-        call=lambda: main([str(folder / WORK)]),
-        command=("-m", "surfkit.study.rows", str(folder / WORK)),
+        call=lambda: main([str(folder / ROW_FILE)]),
+        command=("-m", "surfkit.study.rows", str(folder / ROW_FILE)),
         cost=sum(stage.steps for _, stage, _ in recipe.stages()) if recipe.has_stages else recipe.length or 1,
         needs=(work.trial.data.path.resolve(), *([work.trial.truth.path] if work.trial.truth else [])),
     )
 
 
-def outcome_of(work: Work, result: JobResult) -> Outcome:
+def outcome_of(work: TrialJob, result: JobResult) -> TrialResult:
     """What the process of a row has written, or else how it ended."""
-    path = work.trial.folder / OUTCOME
+    path = work.trial.folder / OUTCOME_FILE
     if path.exists():
-        return read_json(path, Outcome)
+        return read_json(path, TrialResult)
     if result.why is not None:
-        return Outcome(failed=result.why)
+        return TrialResult(failed=result.why)
     status = result.status
     ended = f"ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
     memory = " while memory ran out" * (result.kind == "oom")
-    return Outcome(failed=f"its process {ended}{memory}; see {work.trial.folder / LOG}")
+    return TrialResult(failed=f"its process {ended}{memory}; see {work.trial.folder / LOG}")
 
 
 def main(words: Sequence[str]) -> int:
@@ -195,10 +195,10 @@ def main(words: Sequence[str]) -> int:
     path = Path(words[0])
     try:
         with stop_with_driver(int(os.environ.get(DRIVER, 0))):
-            outcome = attempt(read_json(path, Work))
+            outcome = attempt(read_json(path, TrialJob))
     except KeyboardInterrupt:
-        return INTERRUPTED
-    write_json(path.with_name(OUTCOME), outcome)
+        return INTERRUPTED_STATUS
+    write_json(path.with_name(OUTCOME_FILE), outcome)
     return 0
 
 
@@ -212,7 +212,7 @@ def stop_with_driver(driver: int) -> Iterator[None]:
     over = threading.Event()
 
     def watch() -> None:
-        while not over.wait(POLL_S):
+        while not over.wait(CHILD_POLL_S):
             if os.getppid() != driver:
                 os.kill(os.getpid(), signal.SIGTERM)
                 return

@@ -7,16 +7,28 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
-from surfkit.study.columns import COLUMNS
+from surfkit.study.columns import TABLE_COLUMNS
 from surfkit.study.table import data_name, data_sets
 
-HEAD = ("table", "data", "number", "row", "built_on", "kept", "seed", "folder", *COLUMNS, "failed", "not_as_named")
+CSV_HEADER = (
+    "table",
+    "data",
+    "number",
+    "row",
+    "built_on",
+    "kept",
+    "seed",
+    "folder",
+    *TABLE_COLUMNS,
+    "failed",
+    "not_as_named",
+)
 
 
 def comma_separated(report: Mapping[str, Any]) -> str:
     """Every run of the table in seconds, bytes and counts; a row without any run is a line without numbers."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, HEAD, restval="", lineterminator="\n")
+    writer = csv.DictWriter(text, CSV_HEADER, restval="", lineterminator="\n")
     writer.writeheader()
     for entry in data_sets(report):
         for row in entry["rows"]:
@@ -31,5 +43,5 @@ def comma_separated(report: Mapping[str, Any]) -> str:
                 "not_as_named": row.get("not_as_named") or "",
             }
             for run in row["runs"] or [{}]:
-                writer.writerow(facts | {name: run[name] for name in HEAD if name in run})
+                writer.writerow(facts | {name: run[name] for name in CSV_HEADER if name in run})
     return text.getvalue()

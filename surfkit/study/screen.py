@@ -16,8 +16,8 @@ from rich.text import Text
 
 from surfkit.core.check import printable
 from surfkit.core.events import say
-from surfkit.study.columns import COLUMNS
-from surfkit.study.rows import Outcome, Trial
+from surfkit.study.columns import TABLE_COLUMNS
+from surfkit.study.rows import Trial, TrialResult
 from surfkit.study.table import drawing
 from surfkit.train.progress import outer
 
@@ -25,7 +25,7 @@ TOLD = {"psnr": "PSNR {} dB", "ssim": "SSIM {}", "lpips": "LPIPS {}", "f1": "F1 
 """What is told of a run that has ended, as far as it was measured."""
 
 
-class Screen:
+class AblationScreen:
     """A table that fills itself, with the progress of the run at hand below it; lines where there is no terminal."""
 
     def __init__(self, console: Console | None = None) -> None:
@@ -36,7 +36,7 @@ class Screen:
         self.headings: dict[Path, str] = {}
         self.within = ExitStack()
 
-    def __enter__(self) -> Screen:
+    def __enter__(self) -> AblationScreen:
         if self.console.is_terminal:
             live = Live(console=self.console, auto_refresh=False, transient=True)
             self.live = self.within.enter_context(live)
@@ -63,14 +63,14 @@ class Screen:
         bar.add_row(stage, ProgressBar(steps, index, width=20), line)
         self.draw(Group(Text(printable(self.heading)), bar))
 
-    def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
+    def end(self, trial: Trial, outcome: TrialResult, report: Mapping[str, Any]) -> None:
         """See `Watch.end`."""
         self.report, heading = report, self.headings[trial.folder]
         if outcome.failed is not None:
             say(f"{heading}: failed: {outcome.failed}")
         elif self.live is None and outcome.figures is not None:
             found = outcome.figures
-            told = [text.format(COLUMNS[name].text(found[name])) for name, text in TOLD.items() if name in found]
+            told = [text.format(TABLE_COLUMNS[name].text(found[name])) for name, text in TOLD.items() if name in found]
             say(f"{heading}: {', '.join(told)}, {found['seconds'] / 60:.1f} minutes")
 
     def draw(self, below: Any) -> None:

@@ -26,7 +26,7 @@ from surfkit.runs.recipe import Recipe, complete
 from surfkit.runs.resume import compared_data
 from surfkit.runs.shared import versions
 from surfkit.runs.stage import select_rasterizer
-from surfkit.runs.store import StageStore
+from surfkit.runs.store import StageCache
 from surfkit.study.ablation import Table, build, limit_points, pick, scaled
 from surfkit.study.columns import refuse_unknown_columns
 from surfkit.study.compare import compare
@@ -34,15 +34,15 @@ from surfkit.study.latex import latex
 from surfkit.study.notes import lacked_maps, notes_of
 from surfkit.study.others import OtherMesh, measured_mesh, mesh_rows, refuse_unfit
 from surfkit.study.perceptual import refuse_unmeasurable
-from surfkit.study.rows import Outcome, Trial, Work, attempt, finished, run_elsewhere
+from surfkit.study.rows import Trial, TrialJob, TrialResult, attempt, finished, run_elsewhere
 from surfkit.study.runs_csv import comma_separated
 from surfkit.study.sharing import finished_keys, next_wave, shared_stages
 from surfkit.study.table import markdown
 from surfkit.study.truth import Truth
 
-FORMS = {"md": markdown, "tex": latex, "csv": comma_separated}
+TABLE_WRITERS = {"md": markdown, "tex": latex, "csv": comma_separated}
 """What a table is written as beside JSON, by the ending of the file."""
-SINCE: dict[str, Any] = {"missing": "refuse", "alpha": None}
+ADDED_SETTINGS: dict[str, Any] = {"missing": "refuse", "alpha": None}
 """Settings of data sets that older versions had not, and what they do by default: rows of these versions are found."""
 NO_MAPS = "there was no depth map to learn from, so the run is that of a row without"
 """Why a row has no figures although it was run."""
@@ -51,7 +51,7 @@ STORE = "stages"
 
 
 @dataclass(frozen=True)
-class Plan:
+class AblationPlan:
     """What to run.
 
     Attributes:
@@ -106,16 +106,16 @@ class Plan:
         """Each data set with its truth."""
         return list(zip(self.data, self.truth or [None] * len(self.data), strict=True))
 
-    def work(self, trial: Trial) -> Work:
+    def work(self, trial: Trial) -> TrialJob:
         """What a process needs to know to run a trial."""
-        return Work(trial, self.out, self.device, self.out / STORE if self.shared else None, lpips=self.lpips)
+        return TrialJob(trial, self.out, self.device, self.out / STORE if self.shared else None, lpips=self.lpips)
 
     @property
     def lpips(self) -> bool:
         """Whether LPIPS is measured."""
         return "lpips" in self.columns
 
-    def is_done(self, trial: Trial, outcome: Outcome) -> bool:
+    def is_done(self, trial: Trial, outcome: TrialResult) -> bool:
         """Whether all that is wanted of a trial was measured."""
         if outcome.figures is None:
             return False
@@ -124,17 +124,19 @@ class Plan:
         return wanted <= outcome.figures.keys()
 
 
-class Watch(Protocol):
+class AblationWatcher(Protocol):
     """Who is told how it goes."""
 
     def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
         """A run begins, the `at`-th of `count`; with an executor, it is handed over."""
 
-    def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
+    def end(self, trial: Trial, outcome: TrialResult, report: Mapping[str, Any]) -> None:
         """It has ended."""
 
 
-def ablate(plan: Plan, watch: Watch, before: Callable[[Plan, Sequence[Trial]], None] | None = None) -> dict[str, Any]:
+def ablate(
+    plan: AblationPlan, watch: AblationWatcher, before: Callable[[AblationPlan, Sequence[Trial]], None] | None = None
+) -> dict[str, Any]:
     """Run what is not finished yet, keep the results up to date in the folder, and return them as they are saved.
 
     Args:
@@ -166,7 +168,7 @@ class Session:
         watch: Is told how it goes.
     """
 
-    def __init__(self, plan: Plan, watch: Watch) -> None:
+    def __init__(self, plan: AblationPlan, watch: AblationWatcher) -> None:
         self.plan, self.watch = plan, watch
         self.every = trials(plan)
         self.outcomes = known_outcomes(self.every)
@@ -175,7 +177,7 @@ class Session:
     def run(self, left: Sequence[Trial]) -> dict[str, Any]:
         """Run some trials, and return the report."""
         plan, waiting, count = self.plan, list(left), len(left)
-        StageStore(plan.out / STORE).sweep()
+        StageCache(plan.out / STORE).sweep()
         self.save()
         while waiting:
             wave = self.wave(waiting)
@@ -215,19 +217,19 @@ class Session:
         self.report = save(self.plan, self.every, self.outcomes)
 
 
-def known_outcomes(every: Sequence[Trial]) -> dict[Path, Outcome]:
+def known_outcomes(every: Sequence[Trial]) -> dict[Path, TrialResult]:
     """The outcomes of the trials that were finished before, by the folders of their runs."""
     found = {trial.folder: finished(trial) for trial in every}
-    return {folder: Outcome(known) for folder, known in found.items() if known is not None}
+    return {folder: TrialResult(known) for folder, known in found.items() if known is not None}
 
 
-def report_so_far(plan: Plan) -> dict[str, Any]:
+def report_so_far(plan: AblationPlan) -> dict[str, Any]:
     """Plain data of the whole table as far as it has been run; nothing is run, and nothing written."""
     every = trials(plan)
     return report_of(plan, every, known_outcomes(every))
 
 
-def trials(plan: Plan) -> list[Trial]:
+def trials(plan: AblationPlan) -> list[Trial]:
     """Every row with every seed on every data set; all rows with the first seed come first, so that the table is soon
     whole."""
     recipes = {label: sized(recipe, plan) for label, recipe in build(plan.table).items()}
@@ -241,7 +243,7 @@ def trials(plan: Plan) -> list[Trial]:
     return found
 
 
-def sized(recipe: Recipe, plan: Plan) -> Recipe:
+def sized(recipe: Recipe, plan: AblationPlan) -> Recipe:
     """A row's recipe at the length and with the limit of the plan, and with a mesh where F1 is wanted."""
     if plan.truth and recipe.mesh is None and "mesh" not in recipe.unused:
         recipe = replace(recipe, mesh=TSDF())
@@ -249,7 +251,7 @@ def sized(recipe: Recipe, plan: Plan) -> Recipe:
     return limit_points(recipe, plan.max_points) if recipe.has_stages else recipe
 
 
-def mesh_alone(plan: Plan) -> list[str]:
+def mesh_alone(plan: AblationPlan) -> list[str]:
     """Labels of the rows that make a mesh and draw no pictures, where no mesh is compared: they have no quality to
     show, and are run only where they are named."""
     if plan.truth or plan.rows:
@@ -257,7 +259,7 @@ def mesh_alone(plan: Plan) -> list[str]:
     return [label for label, recipe in build(plan.table).items() if not recipe.method.draws]
 
 
-def unfinished(plan: Plan) -> list[Trial]:
+def unfinished(plan: AblationPlan) -> list[Trial]:
     """The trials of the rows of a plan that are still to be run, one for each folder."""
     every, labels, passed_over = trials(plan), pick(plan.table, plan.rows), mesh_alone(plan)
     known = known_outcomes(every)
@@ -265,7 +267,7 @@ def unfinished(plan: Plan) -> list[Trial]:
     for trial in every:
         if trial.label not in labels or trial.label in passed_over:
             continue
-        if not plan.is_done(trial, known.get(trial.folder, Outcome())):
+        if not plan.is_done(trial, known.get(trial.folder, TrialResult())):
             first.setdefault(trial.folder, trial)
     return list(first.values())
 
@@ -284,7 +286,7 @@ def fingerprint(recipe: Recipe, data: Data, code: Mapping[str, str]) -> str:
         data: What it was done with.
         code: Versions of the packages that did it: surfkit, and the plugins whose parts are in the recipe.
     """
-    since = {name for name, usual in SINCE.items() if getattr(data, name) == usual}
+    since = {name for name, usual in ADDED_SETTINGS.items() if getattr(data, name) == usual}
     parts = {
         "recipe": {name: it for name, it in dump(replace(recipe, about="")).items() if name != "test_every"},
         "data": {name: it for name, it in dump(replace(data, path=data.path.resolve())).items() if name not in since},
@@ -293,7 +295,7 @@ def fingerprint(recipe: Recipe, data: Data, code: Mapping[str, str]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def refuse_unusable(plan: Plan) -> None:
+def refuse_unusable(plan: AblationPlan) -> None:
     """BadInput for what would make every run fail, before anything is written."""
     select_rasterizer(plan.device)
     plan.workers.ready()
@@ -311,7 +313,7 @@ def refuse_unusable(plan: Plan) -> None:
             refuse_unmeasurable(held_out)
 
 
-def refuse_other_data(plan: Plan) -> None:
+def refuse_other_data(plan: AblationPlan) -> None:
     """BadInput if finished runs were trained on other photographs, cameras or depth maps than the next ones would be.
 
     One run that looks at depth maps, and one that does not, stand for all on a data set: they were compared alike.
@@ -329,16 +331,16 @@ def refuse_other_data(plan: Plan) -> None:
                 )
 
 
-def save(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
+def save(plan: AblationPlan, every: list[Trial], outcomes: Mapping[Path, TrialResult]) -> dict[str, Any]:
     """Write the table as JSON, Markdown, LaTeX and CSV, and return what is in the first."""
     report = report_of(plan, every, outcomes)
     write_json(plan.out / "ablation.json", report)
-    for ending, form in FORMS.items():
+    for ending, form in TABLE_WRITERS.items():
         write_text(plan.out / f"ablation.{ending}", form(report))
     return report
 
 
-def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
+def report_of(plan: AblationPlan, every: Sequence[Trial], outcomes: Mapping[Path, TrialResult]) -> dict[str, Any]:
     """Plain data of the whole table as far as it has been run."""
     return {
         "table": plan.table.name,
@@ -363,7 +365,7 @@ def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcom
     }
 
 
-def rows_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcome]) -> list[dict[str, Any]]:
+def rows_of(plan: AblationPlan, every: Sequence[Trial], outcomes: Mapping[Path, TrialResult]) -> list[dict[str, Any]]:
     """Plain data of every row on one data set."""
     known = [(trial, outcomes[trial.folder]) for trial in every if trial.folder in outcomes]
     measured: dict[str, dict[int, Mapping[str, float]]] = {}

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from surfkit.core.check import printable
-from surfkit.study.columns import COLUMNS, shown_columns
+from surfkit.study.columns import TABLE_COLUMNS, shown_columns
 from surfkit.study.notes import row_numbers
 from surfkit.study.sharing import sharing_lines
 
@@ -27,7 +27,7 @@ STACKED = "Below each number are the difference and, dimmed, what was published 
 
 
 @dataclass(frozen=True)
-class Cell:
+class FormattedNumber:
     """A number of a table in words.
 
     Attributes:
@@ -67,13 +67,13 @@ def published_columns(report: Mapping[str, Any], names: Sequence[str]) -> list[s
     return [name for name in names if any(name in row["paper"] for row in data_sets(report)[0]["rows"])]
 
 
-def measured_cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[list[Cell]]:
+def measured_cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[list[FormattedNumber]]:
     """The measured numbers of all rows of one data set, row by row."""
     best = [best_rows(rows, name) for name in names]
     return [[_measured(row, name, at in best[i]) for i, name in enumerate(names)] for at, row in enumerate(rows)]
 
 
-def published_cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[list[Cell]]:
+def published_cells(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[list[FormattedNumber]]:
     """The published numbers of all rows, row by row."""
     return [[_published(row, name) for name in names] for row in rows]
 
@@ -93,7 +93,7 @@ def best_rows(rows: Sequence[Mapping[str, Any]], name: str) -> set[int]:
 
     Numbers that are written alike are equally good. Rows that were given up do not count.
     """
-    column, found = COLUMNS[name], set()
+    column, found = TABLE_COLUMNS[name], set()
     for part in parts(rows):
         values = {at: rows[at]["mean"][name] for at in part if name in rows[at]["mean"] and not rows[at]["given_up"]}
         texts = {at: column.text(value) for at, value in values.items()}
@@ -103,19 +103,21 @@ def best_rows(rows: Sequence[Mapping[str, Any]], name: str) -> set[int]:
     return found
 
 
-def _measured(row: Mapping[str, Any], name: str, best: bool) -> Cell:
-    column, step = COLUMNS[name], row["difference"].get(name)
+def _measured(row: Mapping[str, Any], name: str, best: bool) -> FormattedNumber:
+    column, step = TABLE_COLUMNS[name], row["difference"].get(name)
     if name not in row["mean"]:
-        return Cell()
+        return FormattedNumber()
     change = "" if step is None else column.difference(step["mean"], step["base"], step["standard_error"])
-    return Cell(column.text(row["mean"][name], row["sd"][name]), change, best)
+    return FormattedNumber(column.text(row["mean"][name], row["sd"][name]), change, best)
 
 
-def _published(row: Mapping[str, Any], name: str) -> Cell:
-    column, paper, step = COLUMNS[name], row["paper"], row["paper_difference"].get(name)
+def _published(row: Mapping[str, Any], name: str) -> FormattedNumber:
+    column, paper, step = TABLE_COLUMNS[name], row["paper"], row["paper_difference"].get(name)
     if name not in paper:
-        return Cell()
-    return Cell(column.text(paper[name]), "" if step is None else column.difference(step, paper[name] - step))
+        return FormattedNumber()
+    return FormattedNumber(
+        column.text(paper[name]), "" if step is None else column.difference(step, paper[name] - step)
+    )
 
 
 def lines(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -125,8 +127,8 @@ def lines(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     groups = [measured_cells(entry["rows"], names) for entry in entries] + [published_cells(first, paper)]
     head = ["", "row", "on", "seeds"]
     for entry in entries:
-        head += [COLUMNS[name].head + (f" {data_name(entry)}" if len(entries) > 1 else "") for name in names]
-    head += [f"paper: {COLUMNS[name].head}" for name in paper]
+        head += [TABLE_COLUMNS[name].head + (f" {data_name(entry)}" if len(entries) > 1 else "") for name in names]
+    head += [f"paper: {TABLE_COLUMNS[name].head}" for name in paper]
     body = [
         [*names_of_row(report, at), *(str(cell) for group in groups for cell in group[at])] for at in indices(first)
     ]
@@ -199,7 +201,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     for at, cells in enumerate(zip(*(measured_cells(entry["rows"], names) for entry in entries), strict=True)):
         for place, cell in enumerate((cell for group in cells for cell in group), 4):
             if cell.best:
-                rows[at][place] = str(Cell(f"**{cell.value}**", cell.difference))
+                rows[at][place] = str(FormattedNumber(f"**{cell.value}**", cell.difference))
     marks = ["---" if at == 1 else "---:" for at in range(len(head))]
     body = [head, marks]
     for row, data in zip(rows, entries[0]["rows"], strict=True):
@@ -225,7 +227,14 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
     beside = paper if len(entries) > 1 else []
     below = published_cells(rows, names if len(entries) == 1 else beside)
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for head in ("", "row", "on", "seeds", *_heads(entries, names), *(f"{COLUMNS[n].head}\npaper" for n in beside)):
+    for head in (
+        "",
+        "row",
+        "on",
+        "seeds",
+        *_heads(entries, names),
+        *(f"{TABLE_COLUMNS[n].head}\npaper" for n in beside),
+    ):
         table.add_column(
             Text(printable(head, lines=True)), justify="left" if head == "row" else "right", no_wrap=head != "row"
         )
@@ -236,7 +245,7 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
             table.add_row("", Text(printable(row["group"]), "italic"))
         number, label, on, seeds = names_of_row(report, at)
         label = f"> {label}" if row["label"] == running else label
-        stacked = below[at] if len(entries) == 1 else [Cell()] * len(names)
+        stacked = below[at] if len(entries) == 1 else [FormattedNumber()] * len(names)
         cells = [_stacked(cell, *pair, style) for group in own for cell, *pair in zip(group[at], stacked, strict=True)]
         extra = [Text(_two_lines(cell), "dim") for cell in (below[at] if beside else ())]
         table.add_row(number, Text(printable(label), style), on, seeds, *cells, *extra)
@@ -245,13 +254,13 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
 
 def _heads(entries: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterable[str]:
     for entry in entries:
-        yield from (COLUMNS[name].head + (f"\n{data_name(entry)}" if len(entries) > 1 else "") for name in names)
+        yield from (TABLE_COLUMNS[name].head + (f"\n{data_name(entry)}" if len(entries) > 1 else "") for name in names)
 
 
-def _stacked(cell: Cell, paper: Cell, style: str) -> Text:
+def _stacked(cell: FormattedNumber, paper: FormattedNumber, style: str) -> Text:
     text = Text(_two_lines(cell) or "-", style)
     return text.append(f"\n{' '.join(filter(None, [paper.value, paper.difference]))}", "dim") if paper.value else text
 
 
-def _two_lines(cell: Cell) -> str:
+def _two_lines(cell: FormattedNumber) -> str:
     return "\n".join(filter(None, [cell.value, cell.difference]))

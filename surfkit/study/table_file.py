@@ -19,7 +19,7 @@ ENDINGS = (".json", ".py")
 
 
 @dataclass(frozen=True)
-class RowEntry:
+class RowJson:
     """A row in a JSON file; see `Row`.
 
     Attributes:
@@ -42,7 +42,7 @@ class RowEntry:
 
 
 @dataclass(frozen=True)
-class TableEntry:
+class TableJson:
     """A table in a JSON file; see `Table`.
 
     Attributes:
@@ -55,7 +55,7 @@ class TableEntry:
 
     name: str
     base: Any
-    rows: tuple[RowEntry, ...]
+    rows: tuple[RowJson, ...]
     about: str = ""
     columns: tuple[str, ...] = ()
 
@@ -89,7 +89,7 @@ def read_table(word: str) -> Table:
 
 
 def _from_json(path: Path) -> Table:
-    entry = read_json(path, TableEntry)
+    entry = read_json(path, TableJson)
     if not entry.rows:
         raise BadInput(f"{path}: rows: there are none; give at least one")
     try:

@@ -13,7 +13,7 @@ from surfkit.core.optional import needed
 from surfkit.core.registry import plugins
 
 
-class Scalars:
+class TensorBoardWriter:
     """Writes losses, points, memory and held-out PSNR; steps that a run takes again replace those it lost.
 
     Every block and every refinement has a folder of its own, which TensorBoard shows as a run of its own.
@@ -66,7 +66,7 @@ def tensorboard(out: Path) -> Iterator[None]:
     """
     with needed("tensorboard", "--tensorboard"):
         from torch.utils.tensorboard import SummaryWriter
-    scalars = Scalars(out / "tensorboard", SummaryWriter)
+    scalars = TensorBoardWriter(out / "tensorboard", SummaryWriter)
     plugins().register(scalars, "tensorboard")
     try:
         yield

@@ -13,7 +13,7 @@ import torch
 
 from surfkit.core.check import BadInput
 
-PLAIN = (bool, int, float, str, bytes, type(None), Path)
+PLAIN_TYPES = (bool, int, float, str, bytes, type(None), Path)
 
 
 def leaves(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
@@ -30,7 +30,7 @@ def leaves(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
     elif isinstance(value, (list, tuple)):
         for i, item in enumerate(value):
             yield from leaves(item, f"{at}[{i}]")
-    elif isinstance(value, (*PLAIN, torch.Tensor, np.ndarray)):
+    elif isinstance(value, (*PLAIN_TYPES, torch.Tensor, np.ndarray)):
         yield at, value
 
 

@@ -24,8 +24,8 @@ from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.testing.compare import assert_same, refuses, unchanged
 
-HERE = torch.device("cpu")
-LEAF = 70
+CPU = torch.device("cpu")
+LEAF_POINTS = 70
 """Points of a leaf in the files of the check, so that there are several."""
 
 
@@ -125,8 +125,8 @@ def _check_plan(what: str, compressor: Compressor, model: SplatModel) -> Plan:
     if compressor.needs_importance:
         importance = torch.rand(len(model), generator=torch.Generator().manual_seed(1))
     with unchanged(f"{what}: plan", model=model.params, importance=importance):
-        plan = compressor.plan(model, importance, 3, HERE)
-    again = compressor.plan(model, importance, 3, HERE)
+        plan = compressor.plan(model, importance, 3, CPU)
+    again = compressor.plan(model, importance, 3, CPU)
     assert isinstance(plan, Plan), f"{what}: plan returned {type(plan).__name__}, not a Plan"
     assert_same(f"{what}: plan", [plan.tables, plan.marks], [again.tables, again.marks], "draw from its seed only")
     assert plan.encodings == again.encodings, f"{what}: plan is not repeatable; its encodings differ"
@@ -148,7 +148,7 @@ def _check_plan(what: str, compressor: Compressor, model: SplatModel) -> Plan:
 
 def _check_file(what: str, compressor: Compressor, model: SplatModel, plan: Plan, folder: Path) -> None:
     path, again = folder / "model.surfkit", folder / "again.surfkit"
-    write_model(path, model, plan, compressor, most=LEAF)
+    write_model(path, model, plan, compressor, most=LEAF_POINTS)
     read, carried = ModelFile(path).read()
     assert read.primitive == model.primitive, f"{what}: it came back as {read.primitive}"
     _check_columns(what, read.params, kinds_of(model), len(model))
@@ -157,7 +157,7 @@ def _check_file(what: str, compressor: Compressor, model: SplatModel, plan: Plan
             before, after = model.params[name].double().sort(0).values, read.params[name].double().sort(0).values
             worst = float((before - after).abs().max())
             assert worst < 0.5, f"{what}: {name} came back {worst:.3g} away from what they were"
-    write_model(again, read, carried, compressor, most=LEAF)
+    write_model(again, read, carried, compressor, most=LEAF_POINTS)
     assert path.read_bytes() == again.read_bytes(), f"{what}: what comes back of a file gives another file"
 
 
@@ -169,7 +169,7 @@ def _check_coarser(name: str, compressor: Compressor, model: SplatModel, folder:
         sizes = []
         for each in (compressor, other):
             importance = torch.linspace(0, 1, len(model)) if each.needs_importance else None
-            sizes.append(write_model(folder / "coarser.surfkit", model, each.plan(model, importance, 0, HERE), each))
+            sizes.append(write_model(folder / "coarser.surfkit", model, each.plan(model, importance, 0, CPU), each))
         assert sizes[1] < sizes[0], f"{name}.coarser(4.0) gives a file of {sizes[1]} bytes in place of {sizes[0]}"
 
 

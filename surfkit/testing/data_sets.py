@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
@@ -18,7 +18,7 @@ from surfkit.io.datasets.split import Split
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
-def check_split(split: Split, capture: Capture | None = None) -> None:
+def check_split(split: Split, capture: RawDataset | None = None) -> None:
     """AssertionError if a split holds out what is not there, everything, or something else at a second call.
 
     Args:

@@ -10,17 +10,17 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from surfkit.apps.sfm.exif import (
-    ALTITUDE,
-    ALTITUDE_REF,
+    ALTITUDE_REF_TAG,
+    ALTITUDE_TAG,
     EXIF_IFD,
     GPS_IFD,
-    LATITUDE,
-    LATITUDE_REF,
-    LONGITUDE,
-    LONGITUDE_REF,
+    LATITUDE_REF_TAG,
+    LATITUDE_TAG,
+    LONGITUDE_REF_TAG,
+    LONGITUDE_TAG,
 )
 
-FINEST = 10**7
+RATIONAL_DENOMINATOR = 10**7
 """Parts of a second of arc and of a metre."""
 
 
@@ -46,10 +46,10 @@ def write_exif(
     place = tags.get_ifd(GPS_IFD)
     if position is not None:
         latitude, longitude, altitude = position
-        place[LATITUDE_REF], place[LATITUDE] = "N" if latitude >= 0 else "S", _parts(latitude)
-        place[LONGITUDE_REF], place[LONGITUDE] = "E" if longitude >= 0 else "W", _parts(longitude)
-        place[ALTITUDE_REF] = b"\x01" if altitude < 0 else b"\x00"
-        place[ALTITUDE] = IFDRational(round(abs(altitude) * 1000), 1000)
+        place[LATITUDE_REF_TAG], place[LATITUDE_TAG] = "N" if latitude >= 0 else "S", _parts(latitude)
+        place[LONGITUDE_REF_TAG], place[LONGITUDE_TAG] = "E" if longitude >= 0 else "W", _parts(longitude)
+        place[ALTITUDE_REF_TAG] = b"\x01" if altitude < 0 else b"\x00"
+        place[ALTITUDE_TAG] = IFDRational(round(abs(altitude) * 1000), 1000)
     place.update(gps or {})
     block = tags.tobytes()
     block = block if block.startswith(b"Exif\0\0") else b"Exif\0\0" + block
@@ -59,6 +59,6 @@ def write_exif(
 
 def _parts(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]:
     """Degrees, minutes and seconds."""
-    total = round(abs(degrees) * 3600 * FINEST)
-    minutes, seconds = divmod(total, 60 * FINEST)
-    return IFDRational(minutes // 60, 1), IFDRational(minutes % 60, 1), IFDRational(seconds, FINEST)
+    total = round(abs(degrees) * 3600 * RATIONAL_DENOMINATOR)
+    minutes, seconds = divmod(total, 60 * RATIONAL_DENOMINATOR)
+    return IFDRational(minutes // 60, 1), IFDRational(minutes % 60, 1), IFDRational(seconds, RATIONAL_DENOMINATOR)

@@ -14,9 +14,9 @@ from surfkit.apps.sfm.matching import write_features
 from surfkit.testing.compare import assert_same, unchanged
 
 CPU = torch.device("cpu")
-SIZE = (240, 180)
-MOST = 200
-AGAIN = "it may depend on its inputs and settings only"
+PHOTO_SIZE_PX = (240, 180)
+MAX_FEATURES = 200
+DETERMINISM_HINT = "it may depend on its inputs and settings only"
 
 
 def check_feature_extractor(extractor: FeatureExtractor) -> None:
@@ -33,9 +33,9 @@ def check_feature_extractor(extractor: FeatureExtractor) -> None:
     extractor.refuse_missing()
     kind = extractor.descriptors
     assert kind and isinstance(kind, str), f"{name}.descriptors must name what the descriptors are, not {kind!r}"
-    threads = extractor.at_once(SIZE[0] * SIZE[1])
+    threads = extractor.at_once(PHOTO_SIZE_PX[0] * PHOTO_SIZE_PX[1])
     assert threads >= 1, f"{name}.at_once is {threads}; it must be 1 or more"
-    photo, find = _photograph(), extractor.opened(MOST, CPU)
+    photo, find = _photograph(), extractor.opened(MAX_FEATURES, CPU)
     with unchanged(f"{name}.opened", photo=photo):
         found = find(photo)
     keypoints, descriptors = found.keypoints, found.descriptors
@@ -45,8 +45,8 @@ def check_feature_extractor(extractor: FeatureExtractor) -> None:
     )
     assert np.isfinite(keypoints).all(), f"{name}: a keypoint is not finite"
     assert count, f"{name} finds no features in a photograph of blobs"
-    assert count <= 2 * MOST, f"{name} finds {count} features where {MOST} are the most"
-    inside = (keypoints[:, :2] >= 0) & (keypoints[:, :2] <= SIZE)
+    assert count <= 2 * MAX_FEATURES, f"{name} finds {count} features where {MAX_FEATURES} are the most"
+    inside = (keypoints[:, :2] >= 0) & (keypoints[:, :2] <= PHOTO_SIZE_PX)
     assert inside.all(), f"{name}: a keypoint lies outside of the photograph"
     assert (keypoints[:, 2] > 0).all(), f"{name}: a scale is not above 0; write 1 where there is none"
     known = descriptors.dtype in (np.uint8, np.float16)
@@ -57,10 +57,10 @@ def check_feature_extractor(extractor: FeatureExtractor) -> None:
     if kind == "sift":
         right = descriptors.dtype == np.uint8 and descriptors.shape[1] == 128
         assert right, f"{name}: descriptors named sift must be 128 bytes"
-    for other in (find, extractor.opened(MOST, CPU)):
+    for other in (find, extractor.opened(MAX_FEATURES, CPU)):
         again = other(photo)
-        assert_same(f"{name}: keypoints", keypoints, again.keypoints, AGAIN)
-        assert_same(f"{name}: descriptors", descriptors, again.descriptors, AGAIN)
+        assert_same(f"{name}: keypoints", keypoints, again.keypoints, DETERMINISM_HINT)
+        assert_same(f"{name}: descriptors", descriptors, again.descriptors, DETERMINISM_HINT)
 
 
 def check_feature_matcher(matcher: FeatureMatcher, descriptors: str = "sift") -> None:
@@ -93,16 +93,16 @@ def check_feature_matcher(matcher: FeatureMatcher, descriptors: str = "sift") ->
             assert (matches[:, at] < most).all(), f"{name}: a match is with feature {matches[:, at].max()} of {most}"
             assert len(np.unique(matches[:, at])) == len(matches), f"{name}: a feature is in two matches of a pair"
     for one, two in zip(found, again, strict=True):
-        assert_same(f"{name}.match", one, two, AGAIN)
+        assert_same(f"{name}.match", one, two, DETERMINISM_HINT)
 
 
 def _photograph() -> torch.Tensor:
     """(3, H, W) uint8 of blobs of several sizes and colours."""
     rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    shown = np.full((3, SIZE[1], SIZE[0]), 128.0)
+    x, y = np.meshgrid(np.arange(PHOTO_SIZE_PX[0]), np.arange(PHOTO_SIZE_PX[1]))
+    shown = np.full((3, PHOTO_SIZE_PX[1], PHOTO_SIZE_PX[0]), 128.0)
     for _ in range(150):
-        away = (x - rng.uniform(0, SIZE[0])) ** 2 + (y - rng.uniform(0, SIZE[1])) ** 2
+        away = (x - rng.uniform(0, PHOTO_SIZE_PX[0])) ** 2 + (y - rng.uniform(0, PHOTO_SIZE_PX[1])) ** 2
         shown += rng.uniform(-70, 70, (3, 1, 1)) * np.exp(-away / (2 * rng.uniform(1.5, 6) ** 2))
     return torch.from_numpy(shown.clip(0, 255).round().astype(np.uint8))
 
@@ -111,7 +111,7 @@ def _features(kind: str) -> dict[str, Features]:
     """Features of three photographs, most of them alike, in another order each."""
     rng = np.random.default_rng(0)
     codes, found = np.abs(rng.normal(0, 1, (200, 128))), {}
-    at = rng.uniform(5, np.array(SIZE) - 5, (200, 2))
+    at = rng.uniform(5, np.array(PHOTO_SIZE_PX) - 5, (200, 2))
     for name, count in (("a", 180), ("b", 160), ("c", 150)):
         chosen = rng.permutation(200)[:count]
         seen = codes[chosen] + rng.normal(0, 0.05, (count, 128))
@@ -128,11 +128,11 @@ def _match_input(place: Path, features: dict[str, Features], pairs: list[tuple[s
     listed.write_text("".join(f"{one} {two}\n" for one, two in pairs))
     opened = engine.Database.open(database)
     try:
-        width, height = SIZE
+        width, height = PHOTO_SIZE_PX
         params = [float(width), width / 2, height / 2, 0.0]
         lens = opened.write_camera(engine.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params))
         for name, found in features.items():
             write_features(engine, opened, opened.write_image(engine.Image(name=name, camera_id=lens)), found, kind)
     finally:
         opened.close()
-    return MatchInput(pairs, features.__getitem__, dict.fromkeys(features, SIZE), kind, CPU, database, listed)
+    return MatchInput(pairs, features.__getitem__, dict.fromkeys(features, PHOTO_SIZE_PX), kind, CPU, database, listed)

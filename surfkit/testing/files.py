@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.io.splats.base import HEAD, Format
+from surfkit.io.splats.base import SNIFFED_BYTES, Format
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 from surfkit.testing.compare import refuses, unchanged
 
-NEAR = 0.01
+MAX_POSITION_ROUNDING = 0.01
 """A position may be rounded to this share of the size of the scene."""
-SHIFT = (500_000.0, 5_600_000.0, 0.0)
+SURVEY_SHIFT = (500_000.0, 5_600_000.0, 0.0)
 """Of survey coordinates."""
 
 
@@ -80,7 +80,7 @@ def _check_model(form: Format, folder: Path, table: SplatTable, what: str) -> No
 def _check_same(what: str, table: SplatTable, found: SplatTable) -> None:
     """Every splat came back near its place, with about its colour, opacity, size and rotation."""
     distance, nearest = torch.cdist(table.means.double(), found.means.double()).min(1)
-    assert float(distance.max()) <= NEAR * 4, (
+    assert float(distance.max()) <= MAX_POSITION_ROUNDING * 4, (
         f"{what}: a position is {float(distance.max()):.3g} away from where it was"
     )
     back = found.take(nearest)
@@ -123,14 +123,14 @@ def _check_refusals(name: str, form: Format, folder: Path, table: SplatTable) ->
 
 def _check_survey(name: str, form: Format, folder: Path, table: SplatTable) -> None:
     """Coordinates of millions come back as they were, or without the shift of the frame."""
-    path, frame = folder / f"survey{form.suffix}", Frame(np.array(SHIFT), 1.0, shift=SHIFT)
-    far = replace(table, means=table.means.double() + torch.tensor(SHIFT, dtype=torch.float64))
+    path, frame = folder / f"survey{form.suffix}", Frame(np.array(SURVEY_SHIFT), 1.0, shift=SURVEY_SHIFT)
+    far = replace(table, means=table.means.double() + torch.tensor(SURVEY_SHIFT, dtype=torch.float64))
     form.write(path, far, frame, _tree(form, far))
     if not _reads(form):
         return
     found = form.read(path).means.double()
     for known in (far.means, table.means.double()):
-        if float(torch.cdist(known - known[0], found - known[0]).min(1).values.max()) <= NEAR * 4:
+        if float(torch.cdist(known - known[0], found - known[0]).min(1).values.max()) <= MAX_POSITION_ROUNDING * 4:
             return
     raise AssertionError(f"{name} loses survey coordinates; write table.file_means(frame)")
 
@@ -147,7 +147,7 @@ def _tree(form: Format, table: SplatTable) -> Tile | None:
 
 
 def _head(path: Path) -> bytes:
-    return b"" if path.is_dir() else path.read_bytes()[:HEAD]
+    return b"" if path.is_dir() else path.read_bytes()[:SNIFFED_BYTES]
 
 
 def _bytes(path: Path) -> dict[str, bytes]:

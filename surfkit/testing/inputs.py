@@ -29,8 +29,8 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.observations import Observations, Seen
-from surfkit.scene.scene import Cloud, Frame, View
+from surfkit.scene.observations import Observations, Observations2D
+from surfkit.scene.scene import Frame, SparsePoints, View
 from surfkit.start.base import StartInput
 from surfkit.testing.synthetic import Flight, Synthetic, photograph, write_colmap
 
@@ -38,11 +38,11 @@ BALL_RADIUS = 0.5
 """Of the ball of `mesh_input`, local units."""
 
 
-def cloud(count: int = 50) -> Cloud:
+def cloud(count: int = 50) -> SparsePoints:
     """Random coloured points in the unit cube."""
     draw = torch.Generator().manual_seed(0)
     xyz = torch.rand(count, 3, generator=draw)
-    return Cloud(xyz, torch.randint(0, 256, (count, 3), generator=draw, dtype=torch.uint8))
+    return SparsePoints(xyz, torch.randint(0, 256, (count, 3), generator=draw, dtype=torch.uint8))
 
 
 def splats(kind: str = "surfel", count: int = 60) -> Splats:
@@ -84,7 +84,7 @@ def crowd(count: int = 200) -> tuple[Points, Step]:
     """Random surfels in the unit cube, some of them large, and step 1,000 of 30,000 about them."""
     draw = torch.Generator().manual_seed(0)
     params = Surfel2D().init(
-        Cloud(torch.rand(count, 3, generator=draw), torch.zeros(count, 3, dtype=torch.uint8)), draw
+        SparsePoints(torch.rand(count, 3, generator=draw), torch.zeros(count, 3, dtype=torch.uint8)), draw
     )
     contribution = torch.rand(count, generator=draw)
     step = Step(
@@ -207,7 +207,7 @@ def _shown(points: Tensor, views: Sequence[View]) -> Observations:
         size = torch.tensor([view.camera.width, view.camera.height])
         at = torch.stack([view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy], 1) / size
         rows = ((z > 0) & ((at >= 0) & (at <= 1)).all(1)).nonzero()[:, 0]
-        seen[view.name] = Seen(rows.numpy(), at[rows].numpy())
+        seen[view.name] = Observations2D(rows.numpy(), at[rows].numpy())
     return Observations(points.double().numpy(), np.zeros(len(points)), seen)
 
 

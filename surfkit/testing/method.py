@@ -70,7 +70,7 @@ def _small_data(folder: Path) -> Data:
     return Data(folder)
 
 
-class _Listener:
+class _Interrupter:
     """Counts steps and progress, and interrupts at the `at`-th of them."""
 
     def __init__(self, at: int | None) -> None:
@@ -87,8 +87,8 @@ class _Listener:
 
 
 @contextmanager
-def _interrupting(at: int | None) -> Iterator[_Listener]:
-    listener = _Listener(at)
+def _interrupting(at: int | None) -> Iterator[_Interrupter]:
+    listener = _Interrupter(at)
     plugins().register(listener)
     try:
         yield listener

@@ -25,7 +25,7 @@ from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import cloud, depth_input, maps, splats, target
 from surfkit.testing.synthetic import Synthetic
 
-AGAIN = "it may depend on its inputs and settings only"
+DETERMINISM_HINT = "it may depend on its inputs and settings only"
 
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
@@ -80,7 +80,7 @@ def check_regularizer(regularizer: Regularizer, given: Splats | None = None) -> 
         with unchanged(name, splats=given):
             value = regularizer(given)
         _check_number(f"{name} of {kind}s", value, leaves)
-        assert torch.equal(value, regularizer(given)), f"{name} is not repeatable; {AGAIN}"
+        assert torch.equal(value, regularizer(given)), f"{name} is not repeatable; {DETERMINISM_HINT}"
         if regularizer.only_seen:
             nothing = regularizer(given.first(0))
             assert torch.isfinite(nothing), f"{name} of no {kind} is {nothing.item()}; a view may show none"
@@ -133,7 +133,7 @@ def check_appearance(appearance: Appearance) -> None:
     numbers, color = appearance.begin(5), torch.rand(3, 12, 16, generator=draw)
     assert len(numbers) == 5, f"{name}.begin(5) has {len(numbers)} rows"
     assert torch.isfinite(numbers).all(), f"{name}.begin is not finite"
-    assert_same(f"{name}.begin", numbers, appearance.begin(5), AGAIN)
+    assert_same(f"{name}.begin", numbers, appearance.begin(5), DETERMINISM_HINT)
     for at, row in enumerate(numbers):
         same = torch.allclose(appearance(row, color), color, atol=1e-5)
         assert same, f"{name}: the numbers that photograph {at} begins with change its colours"
@@ -185,7 +185,7 @@ def check_depth_estimator(estimator: DepthEstimator) -> None:
         resumed = {estimate.at: estimate for estimate in [one, *estimator.estimate(fresh, others)]}
     for estimate in found:
         again = resumed[estimate.at]
-        assert_same(f"{name}.estimate of a photograph after an interruption", estimate, again, AGAIN)
+        assert_same(f"{name}.estimate of a photograph after an interruption", estimate, again, DETERMINISM_HINT)
 
 
 def _check_estimate(name: str, estimator: DepthEstimator, estimate: Estimate, camera: Camera) -> None:

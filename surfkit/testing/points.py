@@ -18,7 +18,7 @@ from surfkit.primitives.points import Points
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import crowd, splats
 
-STEPS = 30_000
+STAGE_STEPS = 30_000
 """Of the stage through which policies are taken."""
 
 
@@ -48,11 +48,13 @@ def check_densify(densify: Densify, given: tuple[Points, Step] | None = None) ->
             random surfels if None.
     """
     given = given or crowd()
-    name, foretold = type(densify).__name__, densify.edits(STEPS)
+    name, foretold = type(densify).__name__, densify.edits(STAGE_STEPS)
     if foretold is not None:
         steps = list(foretold)
         assert steps == sorted(set(steps)), f"{name}.edits: steps must be in order, each of them once"
-        assert not steps or 1 <= steps[0] <= steps[-1] <= STEPS, f"{name}.edits: steps must lie in 1 to {STEPS}"
+        assert not steps or 1 <= steps[0] <= steps[-1] <= STAGE_STEPS, (
+            f"{name}.edits: steps must lie in 1 to {STAGE_STEPS}"
+        )
     added = [index for index, edit in _taken_through(densify, given) if edit is not None and _adds(edit)]
     assert added, _idle(densify, "neither clones nor splits a point")
     count = len(given[0])
@@ -61,7 +63,7 @@ def check_densify(densify: Densify, given: tuple[Points, Step] | None = None) ->
     over = [index for index, edit in taken if edit is not None and _after(edit, count) > most]
     assert not over, f"{name}.limited({most}) adds points beyond {most} after step {over[0]}"
     late = [index for index in added if foretold is not None and index not in foretold]
-    assert not late, f"{name} adds points after step {late[0]}, which edits({STEPS}) does not name"
+    assert not late, f"{name} adds points after step {late[0]}, which edits({STAGE_STEPS}) does not name"
 
 
 def check_prune(prune: Prune) -> None:
@@ -126,13 +128,14 @@ def _taken_through(policy: Policy, given: tuple[Points, Step] | None = None) -> 
     """Steps of a stage of 30,000, and what the policy asks for after each; the points stay as they are."""
     points, step = given or crowd()
     points = replace(points, stats={})
-    for index in [*range(1, 30), *range(100, STEPS + 1, 100)]:
+    for index in [*range(1, 30), *range(100, STAGE_STEPS + 1, 100)]:
         yield index, _edit(policy, points, replace(step, index=index, since_reset=index, seed=index))
 
 
 def _idle(policy: Policy, does: str) -> str:
     return (
-        f"{type(policy).__name__} {does} at any of the steps that were tried, of 1 to {STEPS}; give it settings with "
+        f"{type(policy).__name__} {does} at any of the steps that were tried, of 1 to {STAGE_STEPS}; give it "
+        f"settings with "
         "which it acts on points in the unit cube, or the check says nothing"
     )
 

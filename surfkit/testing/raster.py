@@ -14,12 +14,12 @@ from surfkit.scene.camera import Camera
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import splats
 
-NEAR = 0.01
-OFF = 1e-3
+NEAR_PLANE = 0.01
+MAX_VALUE_ERROR = 1e-3
 """Largest error of a value, as a share of the largest one of its map if that is above 1."""
-ODD = 0.02
+MAX_ODD_SHARE = 0.02
 """Share of the values that may be off: which splats a pixel skips may hang on the last digit."""
-GRADIENT = 0.02
+MAX_GRADIENT_ERROR = 0.02
 """Largest error of the gradients of a tensor, as a share of their norm."""
 
 
@@ -41,18 +41,18 @@ def check_rasterizer(rasterizer: Rasterizer) -> None:
     for kind in ("surfel", "gaussian"):
         given = splats(kind, 30)
         with unchanged(f"{name}.render", splats=given, camera=camera):
-            found, true = (each.render(given, camera, NEAR) for each in (rasterizer, reference))
+            found, true = (each.render(given, camera, NEAR_PLANE) for each in (rasterizer, reference))
         _check_maps(f"{name} of {kind}s", found, true)
         total = _cotangents(true.maps)
         grads, wanted = found.backward(total), true.backward(total)
         _check_gradients(f"{name} of {kind}s", grads, wanted)
-        again = rasterizer.render(given, camera, NEAR)
+        again = rasterizer.render(given, camera, NEAR_PLANE)
         for what, one, two in (("render", found.maps, again.maps), ("backward", grads, again.backward(total))):
             assert_same(f"{name}.{what}", one, two, "sum in a fixed order")
         _check_measures(f"{name} of {kind}s", rasterizer, reference, given)
         _check_refusal(name, rasterizer, given)
         none = replace(given, **{key: value[:0] for key, value in given.tensors().items()})
-        color = rasterizer.render(none, camera, NEAR).maps.color
+        color = rasterizer.render(none, camera, NEAR_PLANE).maps.color
         assert not torch.as_tensor(color).any(), f"{name} draws something where there are no {kind}s"
 
 
@@ -82,12 +82,12 @@ def _check_maps(name: str, found: Render, true: Render) -> None:
     assert not found.radii[~found.seen].any(), f"{name}: `radii` are not 0 where the splat is not seen"
 
 
-def _check_close(what: str, got: Any, wanted: Any, off: float = OFF) -> None:
+def _check_close(what: str, got: Any, wanted: Any, off: float = MAX_VALUE_ERROR) -> None:
     got, wanted = got.double(), wanted.double()
     assert (got.isnan() == wanted.isnan()).all(), f"{what}: NaN is not where the reference has it"
     size = max(1.0, float(wanted.nan_to_num().abs().max())) if wanted.numel() else 1.0
     share = float(((got - wanted).nan_to_num().abs() > off * size).double().mean())
-    assert torch.isfinite(got.nan_to_num()).all() and share <= ODD, (
+    assert torch.isfinite(got.nan_to_num()).all() and share <= MAX_ODD_SHARE, (
         f"{what}: {share:.0%} of the values are not those of the reference"
     )
 
@@ -97,18 +97,18 @@ def _check_gradients(name: str, found: Gradients, true: Gradients) -> None:
         got = getattr(found, key) if key == "signal" else found.tensors()[key]
         assert got.shape == value.shape, f"{name}: the gradient of {key!r} has shape {tuple(got.shape)}"
         error = float((got - value).norm() / value.norm().clamp_min(1e-9))
-        assert error <= GRADIENT, f"{name}: the gradient of {key!r} is off by {error:.0%} of its norm"
+        assert error <= MAX_GRADIENT_ERROR, f"{name}: the gradient of {key!r} is off by {error:.0%} of its norm"
 
 
 def _check_measures(name: str, rasterizer: Rasterizer, reference: Rasterizer, given: Splats) -> None:
     camera = _camera()
-    pairs = [each.contribution(given, camera, NEAR, 0.5, 0.5) for each in (rasterizer, reference)]
+    pairs = [each.contribution(given, camera, NEAR_PLANE, 0.5, 0.5) for each in (rasterizer, reference)]
     for what, got, wanted in zip(("sum", "count"), *pairs, strict=True):
         _check_close(f"{name}: the {what} of contribution", got, wanted, off=0.01)
-    missed = int(((pairs[1][1] > 0) & ~rasterizer.render(given, camera, NEAR).seen).sum())
+    missed = int(((pairs[1][1] > 0) & ~rasterizer.render(given, camera, NEAR_PLANE).seen).sum())
     assert not missed, f"{name}: {missed} splats are blended into pixels, but not `seen`"
     places = torch.rand(200, 3, generator=torch.Generator().manual_seed(1))
-    hidden = [each.opacity_before(given, camera, NEAR, places) for each in (rasterizer, reference)]
+    hidden = [each.opacity_before(given, camera, NEAR_PLANE, places) for each in (rasterizer, reference)]
     _check_close(f"{name}: opacity_before", *hidden)
 
 
@@ -116,7 +116,7 @@ def _check_refusal(name: str, rasterizer: Rasterizer, given: Splats) -> None:
     means = given.means.clone()
     means[3, 1] = float("nan")
     try:
-        rasterizer.render(replace(given, means=means), _camera(), NEAR)
+        rasterizer.render(replace(given, means=means), _camera(), NEAR_PLANE)
     except BadInput:
         return
     raise AssertionError(f"{name} draws a splat at NaN; raise BadInput (see `surfkit.raster.validate`)")

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.undistort import is_panorama
 from surfkit.partition.assign import Assign
@@ -25,14 +25,14 @@ from surfkit.primitives.columns import RATES
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 from surfkit.start.base import Start, StartInput
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import cloud, coarse_model, mesh_input, start_input, survey
 from surfkit.testing.synthetic import Synthetic
 from surfkit.train.refine.base import Refine
 
-ABOUT = 10.0
+MAX_FORECAST_FACTOR = 10.0
 """The number of points that a start expects is right within this factor."""
 
 
@@ -166,7 +166,7 @@ def _files(folder: Path) -> dict[Path, tuple[int, int]]:
     return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in stats.items()}
 
 
-def _check_shots(name: str, found: Capture) -> None:
+def _check_shots(name: str, found: RawDataset) -> None:
     names = [shot.name for shot in found.shots]
     assert names, f"{name} finds no photograph"
     assert len(set(names)) == len(names), f"{name}: two photographs have the same name"
@@ -184,7 +184,7 @@ def _check_shots(name: str, found: Capture) -> None:
         assert sound, f"{what}: the camera has no size, or parameters that are not finite"
 
 
-def _check_sparse(name: str, found: Capture) -> None:
+def _check_sparse(name: str, found: RawDataset) -> None:
     """Sparse points are of the right types, and each photograph has some before it."""
     xyz, rgb = found.xyz, found.rgb
     sound = xyz.ndim == 2 and xyz.shape[1:] == (3,) and xyz.dtype == np.float64 and np.isfinite(xyz).all()
@@ -197,7 +197,7 @@ def _check_sparse(name: str, found: Capture) -> None:
         )
 
 
-def _check_poses(name: str, found: Capture, truth: Synthetic) -> None:
+def _check_poses(name: str, found: RawDataset, truth: Synthetic) -> None:
     """Rotations between cameras, distances up to one factor, and lenses are those of the truth."""
     views = {Path(view.name).name: view.camera for view in (*truth.scene.train, *truth.scene.held_out)}
     shots = [shot for shot in found.shots if shot.path.name in views]
@@ -222,7 +222,7 @@ def _check_poses(name: str, found: Capture, truth: Synthetic) -> None:
         assert np.abs(got - right).max() < 0.01 * lens.width, f"{name}: the camera of {shot.name} is not the true one"
 
 
-def _check_cloud(name: str, cloud: Cloud) -> None:
+def _check_cloud(name: str, cloud: SparsePoints) -> None:
     count = len(cloud.xyz)
     assert count, f"{name} gives no point"
     fields = {"xyz": (torch.float32, (count, 3)), "rgb": (torch.uint8, (count, 3))}
@@ -256,8 +256,8 @@ def _check_model(start: Start, count: int) -> None:
     assert model.sh_degree in known_degrees, f"{name}: sh_degree is {model.sh_degree}, not 0 to {known_degrees[-1]}"
 
 
-def _check_expected(start: Start, cloud: Cloud, known: StartInput) -> None:
+def _check_expected(start: Start, cloud: SparsePoints, known: StartInput) -> None:
     pixels = sum(view.camera.width * view.camera.height for view in known.scene.train)
     name, foretold, count = type(start).__name__, start.expected(len(known.scene.cloud.xyz), pixels), len(cloud.xyz)
-    right = isinstance(foretold, int) and count / ABOUT <= foretold <= count * ABOUT
+    right = isinstance(foretold, int) and count / MAX_FORECAST_FACTOR <= foretold <= count * MAX_FORECAST_FACTOR
     assert right, f"{name}.expected is {foretold}, and the start gives {count} points"

@@ -26,12 +26,31 @@ from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
-MEMORY = 1 << 34
+GPU_MEMORY_BYTES = 1 << 34
 """Bytes."""
-WAITS = {"item", "tolist", "nonzero", "unique", "masked_select", "__bool__", "__float__", "__int__", "__index__"}
+SYNCHRONIZING_OPERATIONS = {
+    "item",
+    "tolist",
+    "nonzero",
+    "unique",
+    "masked_select",
+    "__bool__",
+    "__float__",
+    "__int__",
+    "__index__",
+}
 """Operations after which the host knows something that was computed on the GPU."""
-FACTS = {"data_ptr", "__len__", "__hash__", "__repr__", "__format__", "__dir__", "__reduce_ex__", "untyped_storage"}
-NOT_HERE = {"numpy", "__array__", "__dlpack__"}
+HOST_ATTRIBUTES = {
+    "data_ptr",
+    "__len__",
+    "__hash__",
+    "__repr__",
+    "__format__",
+    "__dir__",
+    "__reduce_ex__",
+    "untyped_storage",
+}
+REFUSED_ATTRIBUTES = {"numpy", "__array__", "__dlpack__"}
 """What takes the memory of a tensor as the CPU's."""
 
 
@@ -43,7 +62,7 @@ class SimulatedGpu(TorchFunctionMode):
         held: Bytes of all tensors on the GPU now.
         peak: Most of them so far, since it was last reset.
         limit: Bytes that the GPU has; what needs more raises what torch raises. None for none: it says that it has
-            `MEMORY`.
+            `GPU_MEMORY_BYTES`.
         refused: Numbers of allocations, counted from 1, that fail as if the GPU were full.
         allocations: How many there have been.
     """
@@ -68,9 +87,9 @@ class SimulatedGpu(TorchFunctionMode):
         if name in ("to", "cpu", "cuda", "type"):
             return self._moved(func, name, args, kwargs)
         there = any(map(is_there, tensors))
-        if name in NOT_HERE and there:
+        if name in REFUSED_ATTRIBUTES and there:
             raise TypeError(f"{name}: can't convert cuda:0 device type tensor to numpy; use Tensor.cpu() first")
-        if there and (name in WAITS or _picks_by_mask(name, args)):
+        if there and (name in SYNCHRONIZING_OPERATIONS or _picks_by_mask(name, args)):
             self._wait(name)
         device = kwargs.pop("device", None)
         if device is not None:
@@ -90,7 +109,7 @@ class SimulatedGpu(TorchFunctionMode):
 
     def free(self) -> int:
         """Bytes that can still be had."""
-        return (MEMORY if self.limit is None else self.limit) - self.held
+        return (GPU_MEMORY_BYTES if self.limit is None else self.limit) - self.held
 
     def _put(self, value: Any, there: bool) -> Any:
         """The same, with all its tensors in a place."""
@@ -149,7 +168,7 @@ class SimulatedGpu(TorchFunctionMode):
 
     def _check(self, name: str, tensors: list[Tensor], args: tuple[Any, ...]) -> None:
         """Raise what CUDA raises where tensors of both places meet; a number of the CPU may meet all."""
-        if name in FACTS or not any(map(is_there, tensors)):
+        if name in HOST_ATTRIBUTES or not any(map(is_there, tensors)):
             return
         others = [t for t in tensors if not is_there(t) and t.dim() > 0]
         if name in ("__getitem__", "__setitem__", "index_put_") and is_there(args[0]):

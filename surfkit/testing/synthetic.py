@@ -15,10 +15,10 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.scene import Frame, Scene, SparsePoints, View
 
 
-class Surface(ABC):
+class SyntheticShape(ABC):
     """A shape in metres, z up."""
 
     @abstractmethod
@@ -39,29 +39,29 @@ class Surface(ABC):
 
 
 @dataclass(frozen=True)
-class Ground(Surface):
+class GroundPlane(SyntheticShape):
     """The plane z = 0."""
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Surface.hit`."""
+        """See `SyntheticShape.hit`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -origins[:, 2] / directions[:, 2]
         return np.where(t > 0, t, np.inf), np.broadcast_to([0.0, 0.0, 1.0], directions.shape)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """See `Surface.distance`."""
+        """See `SyntheticShape.distance`."""
         return np.abs(points[:, 2])
 
 
 @dataclass(frozen=True)
-class Sphere(Surface):
+class Sphere(SyntheticShape):
     """A ball."""
 
     centre: tuple[float, float, float] = (4.0, -2.0, 2.2)
     radius: float = 2.2
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Surface.hit`."""
+        """See `SyntheticShape.hit`."""
         away = origins - self.centre
         a, b = (directions**2).sum(1), (away * directions).sum(1)
         root = b * b - a * ((away**2).sum(1) - self.radius**2)
@@ -70,19 +70,19 @@ class Sphere(Surface):
         return t, (away + np.where(np.isfinite(t), t, 0)[:, None] * directions) / self.radius
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """See `Surface.distance`."""
+        """See `SyntheticShape.distance`."""
         return np.abs(np.linalg.norm(points - self.centre, axis=1) - self.radius)
 
 
 @dataclass(frozen=True)
-class Box(Surface):
+class Box(SyntheticShape):
     """A box with its sides along the axes."""
 
     low: tuple[float, float, float] = (-7.0, -2.0, 0.0)
     high: tuple[float, float, float] = (-1.5, 3.0, 3.0)
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Surface.hit`."""
+        """See `SyntheticShape.hit`."""
         with np.errstate(divide="ignore"):
             sides = np.stack([(np.array(side) - origins) / directions for side in (self.low, self.high)])
         entry, leave = sides.min(0), sides.max(0).min(1)
@@ -91,14 +91,14 @@ class Box(Surface):
         return np.where((t < leave) & (t > 0), t, np.inf), normals
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """See `Surface.distance`."""
+        """See `SyntheticShape.distance`."""
         centre, half = (np.add(self.low, self.high)) / 2, np.subtract(self.high, self.low) / 2
         outside = np.abs(points - centre) - half
         return np.abs(np.linalg.norm(outside.clip(0), axis=1) + outside.max(1).clip(max=0))
 
 
-SURFACES: tuple[Surface, ...] = (Ground(), Box(), Sphere())
-COLORS = np.array([[0.42, 0.52, 0.38], [0.66, 0.42, 0.34], [0.36, 0.48, 0.68]])
+SURFACES: tuple[SyntheticShape, ...] = (GroundPlane(), Box(), Sphere())
+SURFACE_COLORS = np.array([[0.42, 0.52, 0.38], [0.66, 0.42, 0.34], [0.36, 0.48, 0.68]])
 """Mean colour of each surface."""
 
 
@@ -168,7 +168,7 @@ def photograph(flight: Flight | None = None) -> Synthetic:
         camera = Camera(frame.local_pose(pose), width=flight.width, height=flight.height, **lens)
         views.append(View(name, camera, Path("images") / name))
         exact[name] = _exact(camera, pose, waves, frame.scale)
-    cloud = Cloud(torch.from_numpy(frame.to_local(xyz).astype(np.float32)), torch.from_numpy(rgb))
+    cloud = SparsePoints(torch.from_numpy(frame.to_local(xyz).astype(np.float32)), torch.from_numpy(rgb))
     train = tuple(view for view in views if view.name not in held_out)
     return Synthetic(Scene("synthetic", train, tuple(v for v in views if v.name in held_out), cloud, frame), exact)
 
@@ -271,7 +271,7 @@ def _cast(origins: np.ndarray, directions: np.ndarray, waves: list) -> tuple[np.
         where = origins[here] + t[here, None] * directions[here]
         depth[here], normal[here] = t[here], normals[here]
         wave = np.sin(where @ vectors.T + phases)
-        color[here] = COLORS[i] + 0.17 * wave[:, :1] + 0.11 * wave[:, 1:]
+        color[here] = SURFACE_COLORS[i] + 0.17 * wave[:, :1] + 0.11 * wave[:, 1:]
     return depth, normal, color
 
 

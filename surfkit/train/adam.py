@@ -11,11 +11,11 @@ from torch import Tensor
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster import native
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
-SOURCE = Source(Path(__file__).parent / "cuda" / "adam.cu")
-PER_BLOCK = 1024
+ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
+VALUES_PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
@@ -60,7 +60,7 @@ def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rat
     """Take one step of Adam on a tensor and its moments, in place."""
     tensors = (value, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
-        launch_update(kernels(SOURCE, value.device), *tensors, rate, index)
+        launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index)
         return
     rate, correction = _corrected(rate, index)
     if native.module() is not None and all(_plain(t) for t in tensors):
@@ -95,7 +95,9 @@ def update_rows(
     """
     tensors = (value, kept, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
-        launch_update_rows(kernels(SOURCE, value.device), value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index)
+        launch_update_rows(
+            kernels(ADAM_SOURCE, value.device), value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index
+        )
         return
     if native.module() is not None and all(_plain(t) for t in tensors):
         rate, correction = _corrected(rate, index)
@@ -134,7 +136,7 @@ def launch_update_rows(
 
 
 def _blocks(grad: Tensor) -> int:
-    return (grad.numel() + PER_BLOCK - 1) // PER_BLOCK
+    return (grad.numel() + VALUES_PER_BLOCK - 1) // VALUES_PER_BLOCK
 
 
 def _numbers(rate: float, index: int) -> tuple[float, ...]:

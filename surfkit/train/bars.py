@@ -15,10 +15,10 @@ from surfkit.core.check import printable
 from surfkit.core.events import Progress
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.train.progress import PLAIN_EVERY_S, larger
+from surfkit.train.progress import BAR_LINE_EVERY_S, larger
 
 
-class Bars:
+class ProgressBars:
     """Shows `Progress` events, one bar for each kind of work."""
 
     def __init__(self, console: Console | None = None) -> None:
@@ -34,7 +34,7 @@ class Bars:
             return
         if self.console.is_terminal:
             self.draw(event)
-        elif event.done == event.total or time.perf_counter() - self.told > PLAIN_EVERY_S:
+        elif event.done == event.total or time.perf_counter() - self.told > BAR_LINE_EVERY_S:
             self.told = time.perf_counter()
             self.console.print(
                 printable(f"{event.what}  {event.done}/{event.total}"), highlight=False, soft_wrap=True, markup=False
@@ -67,7 +67,7 @@ class Bars:
 @contextmanager
 def bars(console: Console | None = None) -> Iterator[None]:
     """Within, progress is shown."""
-    shown = Bars(console)
+    shown = ProgressBars(console)
     plugins().register(shown, "progress bars")
     try:
         yield

@@ -25,12 +25,12 @@ from surfkit.core.codec import load as load_value
 from surfkit.core.files import being_written, remove, sync_folder
 from surfkit.primitives.points import Points
 from surfkit.train.state import StageState
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 
-FORMAT = "surfkit-stage-3"
-GROUPS = {"params": "params", "first": "exp_avg", "second": "exp_avg_sq", "stats": "stats"}
+CHECKPOINT_FORMAT = "surfkit-stage-3"
+TENSOR_GROUPS = {"params": "params", "first": "exp_avg", "second": "exp_avg_sq", "stats": "stats"}
 """Of the columns of points, as a file has them and as `Points` does."""
-SCALARS = {
+SCALAR_FIELDS = {
     "index": int,
     "seconds": float,
     "cpu_seconds": float,
@@ -42,10 +42,10 @@ SCALARS = {
     "skipped": tuple[int, ...],
 }
 """What of a state is written as it is."""
-FACTS = {"views": int, "shown": int, **SCALARS}
-ADDED = {"peak_gpu_bytes": 0}
+FACT_TYPES = {"views": int, "shown": int, **SCALAR_FIELDS}
+ADDED_DEFAULTS = {"peak_gpu_bytes": 0}
 """What files of older versions lack, and stands for it."""
-SYSTEM = re.compile(r"os error (\d+)")
+OS_ERROR_PATTERN = re.compile(r"os error (\d+)")
 """How safetensors says what the system has refused."""
 Read = TypeVar("Read")
 
@@ -64,7 +64,7 @@ def save(path: Path, state: StageState) -> None:
     small, facts = beside_points(state)
     tensors = small | {
         f"{group}.{name}": value.contiguous()
-        for group, attribute in GROUPS.items()
+        for group, attribute in TENSOR_GROUPS.items()
         for name, value in getattr(state.points, attribute).items()
     }
     tensors |= {f"frozen.{name}": value.contiguous() for name, value in state.frozen.items()}
@@ -77,7 +77,9 @@ def beside_points(state: StageState) -> tuple[dict[str, Tensor], str]:
     tensors = {f"looks.{name}": value.contiguous() for name, value in state.appearances.items()}
     tensors |= {f"shared.{name}": value.contiguous() for name, value in state.points.shared.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
-    facts = {"views": state.order.count, "shown": state.order.at} | {name: getattr(state, name) for name in SCALARS}
+    facts = {"views": state.order.count, "shown": state.order.at} | {
+        name: getattr(state, name) for name in SCALAR_FIELDS
+    }
     return tensors, json.dumps(facts)
 
 
@@ -150,13 +152,13 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         BadInput: They make none.
     """
     facts = _facts(path, tensors, text)
-    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks", "frozen", "shared")}
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*TENSOR_GROUPS, "looks", "frozen", "shared")}
     for key, value in tensors.items():
         group, _, name = key.partition(".")
         if group in groups:
             groups[group][name] = value
     appearances, frozen = groups.pop("looks"), groups.pop("frozen")
-    columns = {attribute: groups[group] for group, attribute in GROUPS.items()}
+    columns = {attribute: groups[group] for group, attribute in TENSOR_GROUPS.items()}
     points = Points(**columns, shared=groups["shared"])
     _check(path, points, tensors["order"], facts)
     _check_frozen(path, points, frozen)
@@ -165,9 +167,14 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         generator.set_state(tensors["generator"])
     except (TypeError, RuntimeError) as error:
         raise _unusable(path, "the state of the random generator is none") from error
-    order = Order(facts["views"], tensors["order"], facts["shown"])
+    order = ViewOrder(facts["views"], tensors["order"], facts["shown"])
     state = StageState(
-        points, order, generator, appearances=appearances, frozen=frozen, **{name: facts[name] for name in SCALARS}
+        points,
+        order,
+        generator,
+        appearances=appearances,
+        frozen=frozen,
+        **{name: facts[name] for name in SCALAR_FIELDS},
     )
     state.skipped = list(state.skipped)
     return state
@@ -179,11 +186,11 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
     from safetensors.torch import save_file
 
     tensors = {name: value.cpu() for name, value in tensors.items()}
-    metadata = {"format": FORMAT, "facts": facts, "digest": _digest(tensors, facts)}
+    metadata = {"format": CHECKPOINT_FORMAT, "facts": facts, "digest": _digest(tensors, facts)}
     try:
         save_file(tensors, part, metadata=metadata)
     except SafetensorError as error:
-        said = SYSTEM.search(str(error))
+        said = OS_ERROR_PATTERN.search(str(error))
         code = int(said[1]) if said else errno.EIO
         raise OSError(code, os.strerror(code), str(part)) from error
     mask = os.umask(0o077)  # it can only be read by being set
@@ -209,9 +216,10 @@ def reading(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
+            if metadata.get("format") != CHECKPOINT_FORMAT:
                 raise BadInput(
-                    f"{path} is of format {metadata.get('format')!r}, not {FORMAT!r}; delete it to start anew"
+                    f"{path} is of format {metadata.get('format')!r}, not {CHECKPOINT_FORMAT!r}; delete it to start "
+                    f"anew"
                 )
             if "facts" not in metadata:
                 raise BadInput(f"{path} is no readable checkpoint (it lacks its facts); delete it to start anew")
@@ -230,12 +238,12 @@ def _facts(path: Path, tensors: Mapping[str, Tensor], text: str) -> dict[str, An
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
     if not isinstance(facts, dict):
         raise _unusable(path, "it lacks its facts")
-    facts = ADDED | facts
+    facts = ADDED_DEFAULTS | facts
     wanted = {"params.means", "order", "generator"}
-    if missing := (wanted - tensors.keys()) | (FACTS.keys() - facts.keys()):
+    if missing := (wanted - tensors.keys()) | (FACT_TYPES.keys() - facts.keys()):
         raise _unusable(path, f"it lacks {', '.join(sorted(missing))}")
     try:
-        return {name: load_value(hint, facts[name], name) for name, hint in FACTS.items()}
+        return {name: load_value(hint, facts[name], name) for name, hint in FACT_TYPES.items()}
     except BadInput as error:
         raise _unusable(path, str(error)) from error
 
@@ -274,7 +282,7 @@ def digest(facts: str, tensors: Iterable[tuple[str, Tensor, Iterable[Tensor]]]) 
 def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> None:
     """Every column must have a row per point, every parameter its moments, and the order every view."""
     count = tuple(points.params["means"].shape[:1])
-    for group, attribute in GROUPS.items():
+    for group, attribute in TENSOR_GROUPS.items():
         for name, value in getattr(points, attribute).items():
             if name not in points.shared and (not count or value.shape[:1] != count):
                 raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {sum(count)} points")

@@ -10,18 +10,18 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.depth_prior import Alignment, Priors, prior_bytes, read_priors
+from surfkit.io.datasets.depth_prior import DepthAlignment, Priors, prior_bytes, read_priors
 from surfkit.io.datasets.masks import mask_cache, mask_sizes
 from surfkit.losses.base import Loss
 from surfkit.raster.nvrtc.memory import free_gpu_bytes
 from surfkit.scene.align import SCALE_BAND
 from surfkit.scene.cache import Cache, share
-from surfkit.scene.copies import Copies
+from surfkit.scene.copies import DecodedPhotoCache
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene
 
-LOWERED = 4
+CACHE_REDUCTION = 4
 """The caches keep this share of what they held when memory ran short, the first time; nothing the second time."""
 
 GPU_SHARE = 0.25
@@ -98,7 +98,7 @@ class TrainingData:
         if not any(cache.budget for cache in self.caches()):
             return None
         for cache in self.caches():
-            kept = cache.bytes // LOWERED
+            kept = cache.bytes // CACHE_REDUCTION
             cache.resize(kept if kept > max(cache.sizes, default=0) and not cache.lowered else 0)
         give_back()
         return before, sum(cache.bytes for cache in self.caches())
@@ -121,7 +121,7 @@ def scale_band(losses: Mapping[str, Loss]) -> tuple[float, float]:
 
 
 def read_ahead(
-    data: Data, scene: Scene, losses: Mapping[str, Loss], caches: CacheSettings, known: Alignment | None = None
+    data: Data, scene: Scene, losses: Mapping[str, Loss], caches: CacheSettings, known: DepthAlignment | None = None
 ) -> TrainingData:
     """The photographs, masks and depth priors of the training views, as far as losses need them.
 
@@ -133,6 +133,6 @@ def read_ahead(
     wanted = [3 * pixels, sum(mask_sizes(scene.train)), prior_bytes(normals) * pixels if needed else 0]
     for_photos, for_masks, for_priors = share(budget, wanted)
     priors = read_priors(data, scene, for_priors, known, normals) if needed else None
-    copies = Copies(data.path) if caches.copies and 3 * pixels > for_photos else None
+    copies = DecodedPhotoCache(data.path) if caches.copies and 3 * pixels > for_photos else None
     photos, masks = photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks)
     return TrainingData(photos, masks, priors, caches.gpu)

@@ -16,7 +16,7 @@ from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory
 from surfkit.core.memory import out_of_memory as say_out_of_memory
 from surfkit.train.loss_gradients import as_numbers
 
-MOST_HALVINGS = 2
+MAX_RATE_HALVINGS = 2
 """Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""
 
 

@@ -17,7 +17,7 @@ from surfkit.train.state import StageState
 
 
 @dataclass(frozen=True)
-class InView:
+class PointsInView:
     """R of N points.
 
     Attributes:
@@ -30,13 +30,15 @@ class InView:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, primitive: Primitive, params: Columns, camera: Camera, rasterizer: Rasterizer, near: float) -> InView:
+    def of(
+        cls, primitive: Primitive, params: Columns, camera: Camera, rasterizer: Rasterizer, near: float
+    ) -> PointsInView:
         """The points that may touch a pixel of a view."""
         splats = primitive.activate(params, 0)
         return cls(true_rows(rasterizer.in_view(splats, camera, near)), splats)
 
     @classmethod
-    def of_step(cls, setup: StageSetup, state: StageState, camera: Camera) -> InView | None:
+    def of_step(cls, setup: StageSetup, state: StageState, camera: Camera) -> PointsInView | None:
         """The points that the coming step is for; None where it is for all (`Stage.update`)."""
         stage = setup.stage
         if stage.update == "all" or stage.regularizers or stage.is_paired(state.index + 1):
@@ -63,7 +65,7 @@ def with_frozen(
     if not frozen:
         return splats
     if camera is not None:
-        frozen = InView.of(setup.primitive, frozen, camera, setup.rasterizer, setup.stage.near).of_columns(frozen)
+        frozen = PointsInView.of(setup.primitive, frozen, camera, setup.rasterizer, setup.stage.near).of_columns(frozen)
     shared = {name: value.detach() for name, value in state.points.shared.items()}
     return splats.and_then(setup.primitive.activate(frozen | shared, degree))
 

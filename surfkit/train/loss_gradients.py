@@ -89,12 +89,12 @@ def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Ten
     """
     splats, grads = shape.named(), gradients.named()
     names = [name for name, value in splats.items() if value.requires_grad and name in grads]
-    known = _Known.apply([grads[name] for name in names], *(splats[name] for name in names))
+    known = _KnownGradient.apply([grads[name] for name in names], *(splats[name] for name in names))
     raw = torch.autograd.grad([known, *terms], list(leaves.values()), allow_unused=True)
     return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}
 
 
-class _Known(torch.autograd.Function):
+class _KnownGradient(torch.autograd.Function):
     """A scalar whose gradients by some tensors are known already.
 
     To give them to `torch.autograd.grad` as `grad_outputs` comes to the same, but torch then imports sympy, which takes

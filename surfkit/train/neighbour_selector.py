@@ -11,17 +11,17 @@ from torch import Tensor
 
 from surfkit.scene.camera import Camera
 
-ANGLE = 10.0
+BEST_ANGLE_DEGREES = 10.0
 """Best angle between the rays of two views, degrees: less gives no parallax, more shows other things."""
-NARROW, WIDE = 1 / 3, 1.0
+FALLOFF_BELOW, FALLOFF_ABOVE = 1 / 3, 1.0
 """How fast a view loses worth below and above the best angle, as shares of it."""
-PLACES = 8
+PLACES_PER_SIDE = 8
 """A rendered depth is looked at in so many places along each side."""
-FEWEST = 8
+MIN_DEPTH_PLACES = 8
 """With fewer places that have a depth, nothing is known of the view."""
-CHOICE = 4
+NEIGHBOURS_PER_VIEW = 4
 """So many neighbours of each view take turns."""
-LEAST, WORSE = 0.1, 0.5
+MIN_WORTH, MIN_WORTH_RATIO = 0.1, 0.5
 """A neighbour is worth at least this, and at least this share of the best one."""
 
 
@@ -53,7 +53,7 @@ class NeighbourSelector:
         return cls(cameras, rotations.float(), shifts.float(), centres.float(), lenses[..., None])
 
     def neighbours(self, at: int, depth: Tensor) -> list[int]:
-        """Positions of up to `CHOICE` cameras that are worth comparing with, best first.
+        """Positions of up to `NEIGHBOURS_PER_VIEW` cameras that are worth comparing with, best first.
 
         A camera is worth the mean over places of the rendered surface of a number in [0, 1]: 0 where the place lies
         outside its picture; else exp(-(a - ANGLE)^2 / 2 s^2) with a the angle between the two rays, and s small below
@@ -64,18 +64,18 @@ class NeighbourSelector:
             depth: (H, W) camera z that it shows, 0 where there is none.
         """
         places = self.places(at, depth)
-        if places.shape[1] < FEWEST:
+        if places.shape[1] < MIN_DEPTH_PLACES:
             return []
         worth = self.worth(at, places)
         worth[at] = 0
-        order = worth.argsort(descending=True, stable=True)[:CHOICE].tolist()
-        least = max(LEAST, WORSE * float(worth[order[0]]))
+        order = worth.argsort(descending=True, stable=True)[:NEIGHBOURS_PER_VIEW].tolist()
+        least = max(MIN_WORTH, MIN_WORTH_RATIO * float(worth[order[0]]))
         return [other for other in order if float(worth[other]) >= least]
 
     def places(self, at: int, depth: Tensor) -> Tensor:
         """(3, P) places in the world on the surface that a camera sees."""
         height, width = depth.shape
-        y, x = (((torch.arange(PLACES) + 0.5) * size / PLACES).long() for size in (height, width))
+        y, x = (((torch.arange(PLACES_PER_SIDE) + 0.5) * size / PLACES_PER_SIDE).long() for size in (height, width))
         z = depth.detach()[y[:, None], x].flatten().float().cpu()
         rays = self.cameras[at].rays()[:, y[:, None], x].flatten(1)
         seen = (rays * z)[:, z > 0]
@@ -94,10 +94,10 @@ class NeighbourSelector:
         rays = torch.nn.functional.normalize(places - self.centres[rows], dim=1)
         cosine = (rays * rays[0]).sum(1).clamp(-1, 1)
         angle = cosine.acos() * (180 / math.pi)
-        spread = ANGLE * torch.where(angle < ANGLE, NARROW, WIDE)
+        spread = BEST_ANGLE_DEGREES * torch.where(angle < BEST_ANGLE_DEGREES, FALLOFF_BELOW, FALLOFF_ABOVE)
         size = depth / fx
         ratio = size / size[0]
-        worth = (-((angle - ANGLE) ** 2) / (2 * spread**2)).exp() * torch.minimum(ratio, 1 / ratio)
+        worth = (-((angle - BEST_ANGLE_DEGREES) ** 2) / (2 * spread**2)).exp() * torch.minimum(ratio, 1 / ratio)
         found = torch.zeros(len(self.cameras))
         found[rows] = torch.where(inside, worth, 0.0).mean(1)
         return found

@@ -12,11 +12,11 @@ from surfkit.losses.base import Neighbour, Target
 from surfkit.raster.api import Maps, Splats
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
-from surfkit.train.uploads import Shown
-from surfkit.train.views import Order
+from surfkit.train.uploads import UploadedView
+from surfkit.train.views import ViewOrder
 
 
-def foretell(setup: StageSetup, order: Order) -> None:
+def foretell(setup: StageSetup, order: ViewOrder) -> None:
     """Say which views come next, so that their pictures can be read ahead."""
     if setup.expect is not None and order.at < len(order.queue):
         setup.expect(setup.uploads.missing(order.queue[order.at :].tolist()))
@@ -64,9 +64,9 @@ def neighbour(setup: StageSetup, state: StageState, splats: Splats, shown: int, 
     return None
 
 
-def _readable(setup: StageSetup, state: StageState, at: int, found: Shown | BadInput) -> Shown | None:
+def _readable(setup: StageSetup, state: StageState, at: int, found: UploadedView | BadInput) -> UploadedView | None:
     """A view; None for one with a damaged photograph, which is named and not shown again."""
-    if isinstance(found, Shown):
+    if isinstance(found, UploadedView):
         return found
     state.skipped.append(at)
     emit(PhotoSkipped(setup.views[at].name, str(found)))

@@ -15,16 +15,16 @@ from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.raster.nvrtc.memory import peak_gpu_bytes
 from surfkit.raster.psnr import psnr
-from surfkit.train.trainer import Done
+from surfkit.train.trainer import CompletedStep
 
-PLAIN_EVERY_S = 5.0
+BAR_LINE_EVERY_S = 5.0
 """Between two lines where there is no terminal to draw on."""
-DRAW_EVERY_S = 0.1
+BAR_EVERY_S = 0.1
 OUTER_EVERY_S = 0.5
 """Between two looks of a larger display, which has more to draw."""
 PSNR_EVERY = 10
 """Steps between two looks at the PSNR of the training view at hand."""
-MEMORY = 0.95
+SMOOTHING = 0.95
 """Share of the past in a smoothed number."""
 
 Draw = Callable[[str, int, int, str], None]
@@ -47,7 +47,7 @@ def larger() -> Draw | None:
     return _OUTER.get()
 
 
-class Display:
+class TrainingDisplay:
     """Step, speed, time left, points, loss, PSNR and memory: a live bar on a terminal, else a line every few seconds.
 
     Loss, PSNR and speed are running means; the PSNR is that of training views.
@@ -57,13 +57,13 @@ class Display:
         self.console = console or Console(stderr=True)
         self.stage, self.steps = stage, steps
         self.outer = _OUTER.get()
-        self.every = OUTER_EVERY_S if self.outer else DRAW_EVERY_S if self.console.is_terminal else PLAIN_EVERY_S
-        self.loss, self.psnr, self.pace = Mean(), Mean(), Mean()
+        self.every = OUTER_EVERY_S if self.outer else BAR_EVERY_S if self.console.is_terminal else BAR_LINE_EVERY_S
+        self.loss, self.psnr, self.pace = RunningMean(), RunningMean(), RunningMean()
         self.last, self.drawn = time.perf_counter(), 0.0
         self.bar: Progress | None = None
         self.task: TaskID | None = None
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> TrainingDisplay:
         if self.outer is None and self.console.is_terminal:
             columns = (
                 TextColumn("{task.description}", markup=False),
@@ -79,7 +79,7 @@ class Display:
         if self.bar is not None:
             self.bar.stop()
 
-    def show(self, done: Done) -> None:
+    def show(self, done: CompletedStep) -> None:
         """Take in one step; draw when it is time."""
         self.loss.add(sum(done.losses.values()))
         last = done.index == self.steps
@@ -109,7 +109,7 @@ class Display:
         finally:
             self.last += time.perf_counter() - began
 
-    def line(self, done: Done) -> str:
+    def line(self, done: CompletedStep) -> str:
         """The numbers of a step, in words."""
         parts = [
             f"step {done.index}/{self.steps}",
@@ -124,7 +124,7 @@ class Display:
         return "  ".join(parts)
 
 
-class Mean:
+class RunningMean:
     """A running mean that forgets; exact over its first values."""
 
     def __init__(self) -> None:
@@ -133,4 +133,4 @@ class Mean:
     def add(self, value: float) -> None:
         """Take in a value."""
         self.count += 1
-        self.value += (value - self.value) * max(1 - MEMORY, 1 / self.count)
+        self.value += (value - self.value) * max(1 - SMOOTHING, 1 / self.count)

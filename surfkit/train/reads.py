@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.train.setup import StageSetup
 
-GEOMETRY = {"depth", "median", "normal", "distortion"}
+GEOMETRY_MAPS = {"depth", "median", "normal", "distortion"}
 """Maps beyond the colours."""
 
 

@@ -16,7 +16,7 @@ from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import View
 from surfkit.train.neighbour_selector import NeighbourSelector
 from surfkit.train.stage import Stage, rates_of
-from surfkit.train.uploads import Pictures, Uploads
+from surfkit.train.uploads import TrainingPhotos, Uploads
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class StageSetup:
     stage: Stage
     primitive: Primitive
     views: Sequence[View]
-    photos: Pictures
+    photos: TrainingPhotos
     rasterizer: Rasterizer
     priors: Sequence[DepthPrior | None] | None = None
     masks: Sequence[Tensor | None] | None = None

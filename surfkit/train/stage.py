@@ -18,7 +18,7 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 from surfkit.train.state import StageState
 
-MOST_STEPS = 100_000_000
+MAX_STAGE_STEPS = 100_000_000
 """Of a stage: days and days of the fastest machine."""
 
 
@@ -63,8 +63,8 @@ class Stage:
     and primitives that draw themselves or have parameters that belong to no point always update all."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.steps <= MOST_STEPS:
-            raise BadInput(f"a stage has {self.steps} steps; give 1 to {MOST_STEPS}")
+        if not 1 <= self.steps <= MAX_STAGE_STEPS:
+            raise BadInput(f"a stage has {self.steps} steps; give 1 to {MAX_STAGE_STEPS}")
         if self.sh_every < 1:
             raise BadInput(f"sh_every is {self.sh_every}; it must be 1 or more steps")
         if unknown := set(self.signal.terms or ()) - set(self.losses):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from surfkit.primitives.points import Columns, Points
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 
 
 @dataclass
@@ -15,7 +15,7 @@ class StageState:
     """What an interrupted stage needs to go on as if nothing had happened."""
 
     points: Points
-    order: Order
+    order: ViewOrder
     generator: torch.Generator
     index: int = 0
     """Steps done."""

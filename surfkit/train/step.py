@@ -16,11 +16,11 @@ from surfkit.primitives.edit import Edit, apply, fitted, observe
 from surfkit.train.adam import adam_step
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
-from surfkit.train.in_view import InView, with_frozen
+from surfkit.train.in_view import PointsInView, with_frozen
 from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
 from surfkit.train.next_view import neighbour, next_target
 from surfkit.train.policies import told, wanted
-from surfkit.train.reads import GEOMETRY, maps_of_step
+from surfkit.train.reads import GEOMETRY_MAPS, maps_of_step
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step_result import StepResult
@@ -33,12 +33,12 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     camera, reads = target.view.camera, maps_of_step(setup, index)
 
     # Render: raw parameters become splats, and these the maps that the terms of this step read.
-    in_view = InView.of_step(setup, state, camera)
+    in_view = PointsInView.of_step(setup, state, camera)
     params = state.points.all_params() if in_view is None else in_view.of_columns(state.points.params)
     leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
     shape = setup.primitive.activate(leaves, state.sh_degree)
     splats = with_frozen(setup, state, shape, state.sh_degree, in_view and camera)
-    render = setup.draws.render(splats, camera, stage.near, bool(reads.keys() & GEOMETRY), "distortion" in reads)
+    render = setup.draws.render(splats, camera, stage.near, bool(reads.keys() & GEOMETRY_MAPS), "distortion" in reads)
     refuse_wrong_maps(setup.primitive, render.maps, camera, reads)
     setup.uploads.ahead(state.order, state.skipped)  # the next view is read while the GPU works on this one
 

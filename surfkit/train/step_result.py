@@ -8,7 +8,7 @@ from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Render, Splats
 from surfkit.train.image_appearance import ImageAppearance
-from surfkit.train.in_view import InView
+from surfkit.train.in_view import PointsInView
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class StepResult:
     """
 
     target: Target
-    in_view: InView | None
+    in_view: PointsInView | None
     leaves: Columns
     shape: Splats
     splats: Splats

@@ -19,21 +19,21 @@ from torch import Tensor
 
 from surfkit.primitives.points import Columns, Points
 from surfkit.train import checkpoint
-from surfkit.train.checkpoint import FORMAT
+from surfkit.train.checkpoint import CHECKPOINT_FORMAT
 from surfkit.train.state import StageState
 
-ROWS = 1 << 16
+PIECE_POINTS = 1 << 16
 """Points of a piece."""
-BYTES = 1 << 24
+CHUNK_BYTES = 1 << 24
 """Read at once where rows do not matter."""
-POINTS = ("params.", "first.", "second.", "stats.", "frozen.")
+POINT_TENSOR_PREFIXES = ("params.", "first.", "second.", "stats.", "frozen.")
 """What names of tensors that have a row for each point, or for each frozen one, begin with."""
-CODES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.uint8: "U8"}
+SAFETENSORS_TYPES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.uint8: "U8"}
 """Types as safetensors names them."""
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredState:
     """A whole state in a file.
 
     Attributes:
@@ -46,8 +46,8 @@ class Stored:
 
     def pieces(self) -> Iterator[StageState]:
         """The state with some of its points each time, in their order, and without moments and statistics."""
-        for start in range(0, len(self.state.points), ROWS):
-            yield self.rows(start, start + ROWS)
+        for start in range(0, len(self.state.points), PIECE_POINTS):
+            yield self.rows(start, start + PIECE_POINTS)
 
     def rows(self, start: int, end: int) -> StageState:
         """The state with the points from one row to before another, and without moments and statistics."""
@@ -62,12 +62,12 @@ class Stored:
             return file.get_tensor(f"stats.{name}").clone()
 
 
-def open_last(path: Path) -> tuple[Stored, str | None] | None:
+def open_last(path: Path) -> tuple[StoredState, str | None] | None:
     """As `checkpoint.load_last`, but the points stay in the file."""
     return checkpoint.last_whole(path, opened)
 
 
-def opened(path: Path) -> Stored:
+def opened(path: Path) -> StoredState:
     """The state in a file, which is read to its end once, as what is damaged must not be used.
 
     Raises:
@@ -78,8 +78,8 @@ def opened(path: Path) -> Stored:
     if _digest(path, tensors, metadata["facts"]) != metadata.get("digest"):
         raise checkpoint.damaged(path)
     with checkpoint.reading(path) as (file, _):
-        small = {name: file.get_tensor(name).clone() for name in tensors if not name.startswith(POINTS)}
-    return Stored(path, checkpoint.state_of(path, tensors | small, metadata["facts"]))
+        small = {name: file.get_tensor(name).clone() for name in tensors if not name.startswith(POINT_TENSOR_PREFIXES)}
+    return StoredState(path, checkpoint.state_of(path, tensors | small, metadata["facts"]))
 
 
 def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
@@ -120,11 +120,15 @@ def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
 
 def _begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) -> dict[str, int]:
     """Write what comes before the values, as safetensors lays it out; where those of each tensor go, the rest is 0."""
-    header: dict[str, Any] = {"__metadata__": {"format": FORMAT, "facts": facts, "digest": digest}}
+    header: dict[str, Any] = {"__metadata__": {"format": CHECKPOINT_FORMAT, "facts": facts, "digest": digest}}
     ends = 0
     for name, value in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):  # so that all is aligned
         begins, ends = ends, ends + value.numel() * value.itemsize
-        header[name] = {"dtype": CODES[value.dtype], "shape": list(value.shape), "data_offsets": [begins, ends]}
+        header[name] = {
+            "dtype": SAFETENSORS_TYPES[value.dtype],
+            "shape": list(value.shape),
+            "data_offsets": [begins, ends],
+        }
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
     file.write(len(text).to_bytes(8, "little") + text)
@@ -146,7 +150,7 @@ def _digest(path: Path, tensors: dict[str, Tensor], facts: str) -> str:
     """The digest of the values in a file, which are as many as `tensors` have."""
 
     def values(name: str, like: Tensor) -> Iterator[Tensor]:
-        rows = max(1, BYTES // max(1, math.prod(like.shape[1:]) * like.itemsize))
+        rows = max(1, CHUNK_BYTES // max(1, math.prod(like.shape[1:]) * like.itemsize))
         for start in range(0, len(like) if like.dim() else 1, rows):
             with checkpoint.reading(path) as (file, _):
                 yield file.get_slice(name)[start : start + rows] if like.dim() else file.get_tensor(name)

@@ -22,12 +22,12 @@ from surfkit.train.retry_on_oom import retry_on_oom
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step import densify, update, view_gradients
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 from surfkit.train.watch import Stopwatch
 
 
 @dataclass(frozen=True)
-class Done:
+class CompletedStep:
     """One step, for those who watch."""
 
     index: int
@@ -49,13 +49,13 @@ class Trainer(StageSetup):
                 f"primitive {name_of(self.primitive)} declares the columns {', '.join(sorted(declared))}, and its "
                 f"points have {', '.join(sorted(points.all_params()))}"
             )
-        state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
+        state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
         state.move(self.rasterizer.where())
         return state
 
-    def run(self, state: StageState, clock: Stopwatch | None = None) -> Iterator[Done]:
+    def run(self, state: StageState, clock: Stopwatch | None = None) -> Iterator[CompletedStep]:
         """Take the steps that are left; after each one, `state` can be saved, and the caller may stop.
 
         The points of `state` are moved to where the rasterizer draws. The caller may stop the `clock` of the state.
@@ -70,7 +70,7 @@ class Trainer(StageSetup):
             emit(StepDone(done.index, self.stage.steps, done.losses, done.points, *held))
             yield done
 
-    def step(self, state: StageState) -> Done:
+    def step(self, state: StageState) -> CompletedStep:
         """Take one step (`train.step`). Where the memory of a GPU gives out, what can be repeated is."""
         index = state.index + 1
         if state.index % OBSERVED_EVERY == 0:
@@ -81,4 +81,4 @@ class Trainer(StageSetup):
         if edit is not None:
             retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
         state.index, state.whole = index, True
-        return Done(index, result.losses, len(state.points), result.render.maps, result.target)
+        return CompletedStep(index, result.losses, len(state.points), result.render.maps, result.target)

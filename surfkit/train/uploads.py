@@ -13,12 +13,12 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.cache import out_of_turn
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 
 Known = TypeVar("Known", Tensor, DepthPrior)
 
 
-class Pictures(Protocol):
+class TrainingPhotos(Protocol):
     """Photographs by the position of their view."""
 
     def __getitem__(self, at: int, /) -> Tensor:
@@ -26,7 +26,7 @@ class Pictures(Protocol):
 
 
 @dataclass(frozen=True)
-class Shown:
+class UploadedView:
     """What a step looks at of one view, where the points are.
 
     Attributes:
@@ -65,7 +65,7 @@ class Uploads:
     def __init__(
         self,
         device: torch.device,
-        photos: Pictures,
+        photos: TrainingPhotos,
         masks: Sequence[Tensor | None] | None = None,
         priors: Sequence[DepthPrior | None] | None = None,
         budget_bytes: int = 0,
@@ -73,10 +73,10 @@ class Uploads:
         self._device, self._sources = device, (photos, masks, priors)
         self.bytes, self.budget = 0, budget_bytes if device.type == "cuda" else 0
         self.spared = False
-        self._kept: dict[int, Shown] = {}
-        self._next: dict[int, Shown | BadInput] = {}
+        self._kept: dict[int, UploadedView] = {}
+        self._next: dict[int, UploadedView | BadInput] = {}
 
-    def get(self, at: int) -> Shown | BadInput:
+    def get(self, at: int) -> UploadedView | BadInput:
         """The view to show now; for a damaged photograph, what is wrong with it.
 
         Raises:
@@ -86,16 +86,16 @@ class Uploads:
             return self._kept[at]
         found = self._next.pop(at) if at in self._next else self._read(at)
         self._next.clear()  # something else was expected
-        if isinstance(found, Shown) and self.bytes + found.bytes <= self.budget:
+        if isinstance(found, UploadedView) and self.bytes + found.bytes <= self.budget:
             self._kept[at] = found
             self.bytes += found.bytes
         return found
 
-    def aside(self, at: int) -> Shown | BadInput:
+    def aside(self, at: int) -> UploadedView | BadInput:
         """The same, without a prior, of a view that is looked at out of turn."""
         return self._kept[at] if at in self._kept else self._read(at, aside=True)
 
-    def ahead(self, order: Order, skipped: Collection[int]) -> None:
+    def ahead(self, order: ViewOrder, skipped: Collection[int]) -> None:
         """Begin to upload the view that is shown next, if the order tells; on a CPU there is nothing to do."""
         if self._device.type == "cpu":
             return
@@ -116,7 +116,7 @@ class Uploads:
         self._next.clear()
         return freed
 
-    def _read(self, at: int, aside: bool = False) -> Shown | BadInput:
+    def _read(self, at: int, aside: bool = False) -> UploadedView | BadInput:
         photos, masks, priors = self._sources
         try:
             photo = out_of_turn(photos, at) if aside else photos[at]
@@ -125,7 +125,7 @@ class Uploads:
         mask = None if masks is None else out_of_turn(masks, at) if aside else masks[at]
         prior = None if priors is None or aside else priors[at]
         there = (None if each is None else uploaded(each, self._device) for each in (photo, mask, prior))
-        return Shown(*there)
+        return UploadedView(*there)
 
 
 def uploaded(known: Known, device: torch.device) -> Known:

@@ -14,7 +14,7 @@ from surfkit.scene.scene import View
 
 
 @dataclass
-class Order:
+class ViewOrder:
     """A new random order of `count` views each time all have been shown.
 
     Attributes:

@@ -9,7 +9,7 @@ from surfkit.raster.api import Maps
 from surfkit.raster.footprints import colors
 from surfkit.raster.psnr import psnr
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 
 
 def test_it_begins_by_changing_nothing():
@@ -26,7 +26,9 @@ def test_it_is_the_matrix_and_the_offset():
 
 def test_folded_points_have_the_colours_of_the_mean_photograph():
     draw = torch.Generator().manual_seed(0)
-    cloud = Cloud(torch.rand(30, 3, generator=draw), torch.randint(60, 200, (30, 3), generator=draw, dtype=torch.uint8))
+    cloud = SparsePoints(
+        torch.rand(30, 3, generator=draw), torch.randint(60, 200, (30, 3), generator=draw, dtype=torch.uint8)
+    )
     primitive = Surfel2D(sh_degree=2)
     params = primitive.init(cloud, draw)
     params["sh_rest"] = 0.02 * torch.randn(params["sh_rest"].shape, generator=draw)

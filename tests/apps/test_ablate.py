@@ -89,13 +89,13 @@ def test_a_real_table_interrupted_and_continued(scene, monkeypatch, tmp_path, ca
     command = ["ablate", "table:gradient", "--data", str(scene), "--steps", "4", "--rows", "1", "SSIM"]
     stop = ["--out", "stopped"]
 
-    class Interrupting(stage.Display):
+    class Interrupting(stage.TrainingDisplay):
         def show(self, done):
             if done.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "Display", Interrupting)
+        patch.setattr(stage, "TrainingDisplay", Interrupting)
         assert main([*command, *stop]) == 130
     said = capsys.readouterr().err
     assert "stopped after step 2 of 4" in said and "stopped keeps what is finished; give the same command again" in said

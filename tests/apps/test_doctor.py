@@ -5,9 +5,9 @@ import json
 import pytest
 
 from surfkit.apps.doctor import command as doctor
-from surfkit.apps.doctor.estimate import Estimate
+from surfkit.apps.doctor.estimate import ResourceEstimate
 from surfkit.apps.doctor.finding import Finding
-from surfkit.apps.doctor.forecast import Room
+from surfkit.apps.doctor.forecast import MachineLimits
 from surfkit.cli import main
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -21,8 +21,10 @@ def farm(tmp_path):
 
 def estimated(**changes):
     values = dict(points=5_000, points_known=False, seconds=3_700.0, step_seconds=(0.1, 0.2), memory_bytes=10**9)
-    values |= dict(cache_bytes=10**8, point_bytes=2e3, run_bytes=10**8, data_bytes=0, room=Room(10**10, 10**11, 10**11))
-    return Estimate(**(values | changes))
+    values |= dict(
+        cache_bytes=10**8, point_bytes=2e3, run_bytes=10**8, data_bytes=0, room=MachineLimits(10**10, 10**11, 10**11)
+    )
+    return ResourceEstimate(**(values | changes))
 
 
 def test_for_people(farm, capsys):

@@ -14,8 +14,8 @@ from surfkit.core.codec import write_json
 from surfkit.io.datasets.data import Data
 from surfkit.io.splats.ply import write_points
 from surfkit.partition.base import Cells, Ground
-from surfkit.partition.plan import Block, Plan
-from surfkit.runs.blocks.schedule import Record
+from surfkit.partition.plan import BlockPlan, PartitionPlan
+from surfkit.runs.blocks.schedule import BlocksRecord
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -154,9 +154,9 @@ def in_blocks(folder, tmp_path):
     shutil.copytree(folder / "run", tmp_path / "run")
     ground = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     cells = Cells(ground, ((None, None, 0.0, None), (0.0, None, None, None)), (0, 1))
-    blocks = tuple(Block(index, (), 0, 0, 0.5) for index in (0, 1))
+    blocks = tuple(BlockPlan(index, (), 0, 0, 0.5) for index in (0, 1))
     (tmp_path / "run" / "blocks").mkdir()
-    write_json(tmp_path / "run" / "blocks" / "plan.json", Record(2, Plan(cells, blocks)))
+    write_json(tmp_path / "run" / "blocks" / "plan.json", BlocksRecord(2, PartitionPlan(cells, blocks)))
     return tmp_path / "run"
 
 
@@ -230,7 +230,7 @@ def test_roughness_where_the_truth_is_plane(tmp_path, capsys, monkeypatch):
     """Heights between 0 and h, all as often, have a standard deviation of h over the root of 12."""
     from surfkit.evaluate.mesh import roughness
 
-    monkeypatch.setattr(roughness, "SHARE", 1 / 8)
+    monkeypatch.setattr(roughness, "BALL_RADIUS_SHARE", 1 / 8)
     mesh, truth = ridges(tmp_path)
     options = ("--gt", truth, "--tau", 0.1, "--crop", "none", "--align", "none", "--draws", 1, "--out", tmp_path)
     assert spoken(capsys, mesh, *options)[0] == 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.apps.export import Export, one_tile
+from surfkit.apps.export import ExportCommand, one_tile
 from surfkit.cli import main
 from surfkit.io.splats.files import format_of, read_splat_file
 from surfkit.io.splats.ply import PLY, read_splats
@@ -132,7 +132,7 @@ def test_tiles_on_earth_leave_out_nothing(ply, tmp_path, capsys, monkeypatch):
     def opened(self):
         yield near, frame, one_tile(near), None
 
-    monkeypatch.setattr(Export, "_opened", opened)
+    monkeypatch.setattr(ExportCommand, "_opened", opened)
     status, lines, _ = said(capsys, ply, "format:tiles3d", "--out", tmp_path / "tiles")
     assert status == 0 and not any("offset" in line for line in lines)
     assert said(capsys, ply, "format:tiles3d", "--out", tmp_path / "high", "--geoid", "40")[0] == 0

@@ -10,7 +10,7 @@ from PIL import Image
 
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.core.lock import NAME, locked
+from surfkit.core.lock import LOCK_FILE, locked
 from surfkit.core.tree import evolve
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -74,7 +74,7 @@ def test_one_process_at_a_time_and_what_a_killed_one_left_half_written_goes(farm
         assert "works in it; wait for its end" in capsys.readouterr().err
         assert left.exists() and not maps(farm), "it may be what the other one writes"
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0
-    assert not left.exists() and not (left.parent / NAME).exists() and len(maps(farm)) == 12
+    assert not left.exists() and not (left.parent / LOCK_FILE).exists() and len(maps(farm)) == 12
 
 
 def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, monkeypatch, capsys):

@@ -5,12 +5,12 @@ from itertools import zip_longest
 import pytest
 
 from surfkit.appearance.base import Appearance
-from surfkit.apps.train import Train
+from surfkit.apps.train import TrainCommand
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
-from surfkit.densify import CountCap, Elongation, Faint, Trim
+from surfkit.densify import CountCap, Elongation, PruneByOpacity, Trim
 from surfkit.densify.base import Densify, Filter, Prune, Signal
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1
@@ -21,12 +21,12 @@ from surfkit.primitives.base import Primitive
 
 
 def stage(*words: str):
-    return parse(Train, ["recipe:2dgs", *words], "surfkit train").recipe.pretrain
+    return parse(TrainCommand, ["recipe:2dgs", *words], "surfkit train").recipe.pretrain
 
 
 def test_parts_are_added_to_a_tuple_one_after_the_other():
     made = stage("pretrain.prune.0:trim", "pretrain.prune.1:opacity", "--pretrain.prune.0.ratio", "0.1")
-    assert made.prune == (Trim(ratio=0.1), Faint())
+    assert made.prune == (Trim(ratio=0.1), PruneByOpacity())
     filters = ("pretrain.densify.filters.0:elongation", "pretrain.densify.filters.1:count-cap")
     made = stage("--pretrain.densify.filters.1.points", "5000", *filters)
     assert made.densify.filters == (Elongation(), CountCap(5000))
@@ -38,14 +38,14 @@ def test_a_part_of_the_recipe_is_swapped_or_taken_away(tmp_path):
     from surfkit.study.recipes import SURFELS
 
     file = tmp_path / "r.json"
-    write_json(file, evolve(SURFELS, "pretrain.prune", (Trim(), Faint())))
+    write_json(file, evolve(SURFELS, "pretrain.prune", (Trim(), PruneByOpacity())))
     for words, left in {
-        ("pretrain.prune.0:none",): (Faint(),),
-        ("pretrain.prune.0:opacity",): (Faint(), Faint()),
-        ("pretrain.prune.2:trim", "--pretrain.prune.2.gamma", "1"): (Trim(), Faint(), Trim(gamma=1.0)),
+        ("pretrain.prune.0:none",): (PruneByOpacity(),),
+        ("pretrain.prune.0:opacity",): (PruneByOpacity(), PruneByOpacity()),
+        ("pretrain.prune.2:trim", "--pretrain.prune.2.gamma", "1"): (Trim(), PruneByOpacity(), Trim(gamma=1.0)),
         ("pretrain.prune.1:none", "pretrain.prune.0:none"): (),
     }.items():
-        assert parse(Train, [f"recipe:{file}", *words], "surfkit train").recipe.pretrain.prune == left
+        assert parse(TrainCommand, [f"recipe:{file}", *words], "surfkit train").recipe.pretrain.prune == left
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_a_part_of_the_recipe_is_swapped_or_taken_away(tmp_path):
 )
 def test_a_switch_of_a_part_that_nobody_chose_is_turned_off(words):
     words = ["recipe:2dgs", "--no-prepare", *words, "--mesh.voxel", "2"]
-    assert parse(Train, words, "surfkit train").recipe.mesh == TSDF(voxel=2.0, carve=False)
+    assert parse(TrainCommand, words, "surfkit train").recipe.mesh == TSDF(voxel=2.0, carve=False)
     with pytest.raises(BadInput, match="no option --mesh.no-voxel; perhaps you meant --mesh.voxel"):
-        parse(Train, ["recipe:2dgs", "--mesh.no-voxel"], "surfkit train")
+        parse(TrainCommand, ["recipe:2dgs", "--mesh.no-voxel"], "surfkit train")
 
 
 def test_entries_of_a_dict_come_change_and_go():
@@ -110,7 +110,7 @@ def test_every_component_can_be_put_into_a_recipe_by_a_word(recipe):
     densify = [{f"pretrain.densify:{name}": cls} for name, cls in offered.pop("pretrain.densify").items()]
     rounds = zip_longest(*([(f"{slot}:{name}", cls) for name, cls in known.items()] for slot, known in offered.items()))
     for words in [*densify, *(dict(filter(None, pairs)) for pairs in rounds)]:
-        made = parse(Train, [f"recipe:{recipe}", *words], "surfkit train").recipe
+        made = parse(TrainCommand, [f"recipe:{recipe}", *words], "surfkit train").recipe
         for word, cls in words.items():
             assert isinstance(at(made, word.partition(":")[0]), cls), word
 

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from surfkit.compress.container import ModelFile, write_model
-from surfkit.compress.octree import LEVELS, Leaf, interleaved, leaves, separated
+from surfkit.compress.octree import MAX_TREE_LEVELS, Leaf, interleaved, leaves, separated
 from surfkit.compress.packed import Packed
 from surfkit.compress.plain import Float16, Lossless
-from surfkit.compress.scalars import Cells, Levels, LogSteps, SmallestThree
+from surfkit.compress.scalars import LogSteps, MortonPositions, SmallestThree, UniformLevels
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import IDENTITY
 from surfkit.primitives.gaussian3d import Gaussian3D
@@ -59,7 +59,7 @@ def written(tmp_path, places, encoding=None, most=60):
 @each_place
 @pytest.mark.parametrize("exponent", [None, -30, -6, 40])
 def test_positions(tmp_path, name, places, exponent):
-    encoding = Cells("means", exponent)
+    encoding = MortonPositions("means", exponent)
     file = written(tmp_path, places, encoding)
     assert len(file.index.leaves) > 1 or len(places) <= 60
     seen = []
@@ -74,7 +74,7 @@ def test_positions(tmp_path, name, places, exponent):
         assert ((low <= places[rows]) & (places[rows] < high)).all(), "the box of a leaf holds its points"
         assert ((low <= back) & (back <= high)).all()
         wanted = leaf.exponent - 16 if exponent is None else exponent
-        if leaf.exponent - LEVELS < wanted < leaf.exponent - 1 and wanted >= leaf.finest:
+        if leaf.exponent - MAX_TREE_LEVELS < wanted < leaf.exponent - 1 and wanted >= leaf.finest:
             assert encoding.bound(leaf) == 2.0**wanted / 2, "cells are as small as they are said to be"
     assert sorted(seen) == list(range(len(places)))
 
@@ -82,7 +82,7 @@ def test_positions(tmp_path, name, places, exponent):
 @each_place
 def test_a_file_written_again_is_the_same(tmp_path, name, places):
     for exponent in (None, -30, -6, 40):
-        file = written(tmp_path, places, Cells("means", exponent))
+        file = written(tmp_path, places, MortonPositions("means", exponent))
         before = file.path.read_bytes()
         model, plan = file.read()
         write_model(tmp_path / "again.surfkit", model, plan, Lossless(), most=60)
@@ -97,7 +97,7 @@ def test_places_that_are_none_are_refused(places):
 
 def test_morton_codes():
     """Bit by bit, against a loop."""
-    numbers = DRAW.integers(0, 1 << LEVELS, (50, 3))
+    numbers = DRAW.integers(0, 1 << MAX_TREE_LEVELS, (50, 3))
     codes = interleaved(numbers)
     for (x, y, z), code in zip(numbers.tolist(), codes.tolist(), strict=True):
         assert code == sum(
@@ -126,7 +126,7 @@ def test_radii_rotations_opacities_and_colors(tmp_path, factor):
     assert isinstance(steps, LogSteps)
     assert (before["scales"] - after.params["scales"]).abs().max() <= steps.step / 2 + 1e-5
     levels = by_column["opacities"]
-    assert isinstance(levels, Levels)
+    assert isinstance(levels, UniformLevels)
     away = (before["opacities"].double().sigmoid() - after.params["opacities"].double().sigmoid()).abs()
     assert away.max() <= 0.5 / levels.levels + 1e-7
     assert 0.2 * steps.step < (before["scales"] - after.params["scales"]).abs().mean() < 0.3 * steps.step
@@ -174,7 +174,7 @@ def kind(shape, activation=IDENTITY):
 @pytest.mark.parametrize("levels", [2, 3, 255, 256, 257, 65_536])
 def test_levels_cover_0_to_1(levels):
     values = {"opacities": torch.cat([torch.tensor([0.0, 1.0, 0.5]), torch.rand(500)])}
-    encoding, kinds, leaf = Levels("opacities", levels), {"opacities": kind(())}, Leaf(0, (0, 0, 0), -20)
+    encoding, kinds, leaf = UniformLevels("opacities", levels), {"opacities": kind(())}, Leaf(0, (0, 0, 0), -20)
     streams = encoding.encode(values, kinds, leaf, {})
     back = encoding.decode(streams, kinds, leaf, 503, {})
     assert (back["opacities"] - values["opacities"]).abs().max() <= 0.5 / levels + 1e-7

@@ -16,7 +16,7 @@ import zstandard
 from surfkit.compress.container import ModelFile, write_model
 from surfkit.compress.packed import Packed
 from surfkit.compress.plain import Lossless
-from surfkit.compress.streams import MOST_COMPONENTS, packed, unpacked
+from surfkit.compress.streams import MAX_COMPONENTS, packed, unpacked
 from surfkit.core.check import BadInput
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.testing.compress import splat_model
@@ -227,7 +227,7 @@ def stream_head(name: bytes, size: int, components: int, rows: int, lengths: lis
 
 def test_streams_that_claim_much(tmp_path, whole):
     """Nothing is decoded before its shape is known to fit."""
-    zeros = stream_head(b"means", 8, MOST_COMPONENTS, 131_072, [0] * 8 * MOST_COMPONENTS)
+    zeros = stream_head(b"means", 8, MAX_COMPONENTS, 131_072, [0] * 8 * MAX_COMPONENTS)
     assert "leaf 0 of" in complaint(tmp_path, leaf_of(whole, b"\1" + zeros))
     many = b"".join(stream_head(b"%d" % i, 8, 500, 40, [0] * 4_000) for i in range(254))
     many = stream_head(b"means", 8, 1, 40, [0] * 8) + many
@@ -291,7 +291,7 @@ for path in sys.argv[1:]:
 
 def test_with_little_memory(tmp_path, whole):
     """Crafted files in a process that may add 300 MB: what torch and zstandard take is counted too."""
-    zeros = stream_head(b"means", 8, MOST_COMPONENTS, 131_072, [0] * 8 * MOST_COMPONENTS)
+    zeros = stream_head(b"means", 8, MAX_COMPONENTS, 131_072, [0] * 8 * MAX_COMPONENTS)
     coder = zstandard.ZstdCompressor()
     blocks = whole[HEAD.size : HEAD.unpack(whole[: HEAD.size])[3]]
     files = [

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from surfkit.compress import vectree
-from surfkit.compress.colors import CHOSEN, Codes, PrincipalComponents, principal_components, vectors
+from surfkit.compress.colors import CHOSEN_MARK, Codes, PrincipalComponents, principal_components, vectors
 from surfkit.core.check import BadInput
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.columns import standard_columns
@@ -43,14 +43,14 @@ def test_codes(parts):
     ends = np.cumsum([0, *parts]).tolist()
     cuts = enumerate(zip(ends[:-1], ends[1:], strict=True))
     tables = {f"sh.codes.{at}": np.unique(numbers[:, a:b], axis=0) for at, (a, b) in cuts}
-    check_encoding(Codes(parts), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0}, near=1e-3)
+    check_encoding(Codes(parts), columns, tables, {CHOSEN_MARK: torch.arange(200) % 3 == 0}, near=1e-3)
     with pytest.raises(BadInput, match="codebooks are missing, or not of 12 coefficients together"):
-        check_encoding(Codes((11,)), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0})
+        check_encoding(Codes((11,)), columns, tables, {CHOSEN_MARK: torch.arange(200) % 3 == 0})
 
 
 def test_a_codebook_is_learnt_from_a_sample_of_many_points(monkeypatch):
     """Of two colours only, so that any sample has both."""
-    monkeypatch.setattr(vectree, "LEARNT_FROM", 64)
+    monkeypatch.setattr(vectree, "CODEBOOK_POINTS", 64)
     points = Surfel2D(sh_degree=0)
     params = {name: torch.zeros(1000, *column.shape) for name, column in points.columns().items()}
     params["sh0"][:] = torch.tensor([0.25, 0.5])[torch.arange(1000) % 2][:, None, None]

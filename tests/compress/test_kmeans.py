@@ -116,7 +116,7 @@ def test_equal_distances_go_to_the_lowest_index(engine):
 )
 def test_rounding_errors_rule_no_nearest_code_out(engine, change):
     vectors, codebook = change(clustered(150, 45)), change(clustered(300, 45, seed=1))
-    features, true = search.Features.of(codebook), brute(vectors, codebook)
+    features, true = search.DistanceBounds.of(codebook), brute(vectors, codebook)
     with using(engine):
         every = search.searching(codebook, features).nearest(vectors, features(vectors))  # fewer leave room for errors
         for index, _ in (every, nearest(vectors, codebook)):
@@ -135,7 +135,7 @@ def test_codes_at_nearly_the_same_distance_are_told_apart(engine):
             codes[code, :45] = torch.from_numpy(random.permutation(larger))
         vectors[:, 45] = codes[:60, 45] = away
         codes[60:, 45] = -away - 50
-        features = search.Features.of(codes)  # all of them: fewer leave room for errors
+        features = search.DistanceBounds.of(codes)  # all of them: fewer leave room for errors
         with using(engine):
             index, _ = search.searching(codes, features).nearest(vectors, features(vectors))
         assert index[0] == brute(vectors, codes)[0].argmin()
@@ -151,8 +151,8 @@ def test_nearest_has_the_same_bits_everywhere():
             with using(engine), threads(number):
                 assert same(expected, nearest(vectors, codebook)), f"{engine}, {number} threads"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "ROWS", 100)
-        patch.setattr(search, "ENTRIES", 7000)
+        patch.setattr(search, "VECTORS_PER_CALL", 100)
+        patch.setattr(search, "MAX_TORCH_DISTANCES", 7000)
         for engine in {*ENGINES[:1], TORCH}:
             with using(engine):
                 assert same(expected, nearest(vectors, codebook)), f"{engine} in small parts"
@@ -163,18 +163,18 @@ def test_nearest_has_the_same_bits_everywhere():
 def test_no_number_of_features_changes_a_bit(engine, used):
     vectors, codebook = clustered(400, 45), clustered(260, 45, seed=1)
     with using(engine):
-        all_of_them = search.Features.of(codebook)
-        features = search.Features(all_of_them.mean, all_of_them.axes, used)
+        all_of_them = search.DistanceBounds.of(codebook)
+        features = search.DistanceBounds(all_of_them.mean, all_of_them.axes, used)
         found = search.searching(codebook, features).nearest(vectors, features(vectors))
         assert same(found, nearest(vectors, codebook))
 
 
 def test_distances_of_features_are_at_most_those_of_vectors():
     vectors = clustered(300, 24)
-    features = search.Features.of(vectors)
+    features = search.DistanceBounds.of(vectors)
     true = torch.cdist(vectors.double(), vectors.double())
     for used in (1, 5, 23, 24):
-        few = search.Features(features.mean, features.axes, used)(vectors)
+        few = search.DistanceBounds(features.mean, features.axes, used)(vectors)
         assert few.shape == (300, min(used + 1, 24))
         bound = torch.cdist(few.double(), few.double())
         assert (bound <= true + 1e-6).all() and bound.sum() > 0.3 * true.sum()
@@ -193,7 +193,7 @@ def test_nearest_makes_no_matrix_of_all_distances():
 def test_calls_are_short_and_cover_all_rows(engine, codes, dimensions):
     """Between them, Python sees Ctrl-C."""
     codebook = torch.zeros(codes, dimensions)
-    features = search.Features(torch.zeros(dimensions).double(), torch.eye(dimensions).double(), dimensions)
+    features = search.DistanceBounds(torch.zeros(dimensions).double(), torch.eye(dimensions).double(), dimensions)
     with using(engine), threads(2):
         parts = list(search.searching(codebook, features).parts(100_001))
     assert [part.start for part in parts] == [0, *(part.stop for part in parts[:-1])] and parts[-1].stop == 100_001
@@ -293,7 +293,7 @@ def test_dead_codes_come_to_life():
 def test_a_code_may_be_left_out(engine):
     codebook = clustered(100, 7)
     own = torch.arange(100, dtype=torch.int32)
-    features = search.Features.of(codebook)
+    features = search.DistanceBounds.of(codebook)
     with using(engine):
         index, distance = search.searching(codebook, features).nearest(codebook, features(codebook), own)
     true = brute(codebook, codebook) + np.diag(np.full(100, np.inf))
@@ -354,7 +354,7 @@ def test_iterations_look_at_a_sample_alone():
 def test_progress_rises_to_the_end_and_may_stop_the_work():
     vectors, seen = clustered(2000, 6), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "ROWS", 500)
+        patch.setattr(search, "VECTORS_PER_CALL", 500)
         kmeans(vectors, 10, iterations=100, progress=lambda *at: seen.append(at))
     done, of = zip(*seen, strict=True)
     assert list(done) == sorted(set(done)) and set(of) == {done[-1]} and len(seen) > 10

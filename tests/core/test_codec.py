@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import MOST_NESTED, dump, load, read_json, read_keys, write_json
+from surfkit.core.codec import MAX_NESTING_DEPTH, dump, load, read_json, read_keys, write_json
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ def test_wrong_files_are_named(tmp_path, text, message):
 def test_json_may_be_nested_as_deep_as_is_said_and_no_deeper(tmp_path):
     path = tmp_path / "r.json"
     for left, right in (("[", "]"), ('{"a":', "}")):
-        path.write_text(left * MOST_NESTED + "1" + right * MOST_NESTED)
+        path.write_text(left * MAX_NESTING_DEPTH + "1" + right * MAX_NESTING_DEPTH)
         assert dump(read_json(path, Any))
-        for depth in (MOST_NESTED + 1, 900, 100_000):
+        for depth in (MAX_NESTING_DEPTH + 1, 900, 100_000):
             path.write_text(left * depth + "1" + right * depth)
             with pytest.raises(BadInput, match="r.json: not JSON: nested too deeply"):
                 read_json(path, Any)

@@ -9,7 +9,7 @@ import pytest
 
 from surfkit.core import lock
 from surfkit.core.check import BadInput
-from surfkit.core.lock import FORMER, NAME, lock_holder, locked
+from surfkit.core.lock import FORMER_LOCK_FILE, LOCK_FILE, lock_holder, locked
 
 WAITS = """
 import sys
@@ -32,20 +32,22 @@ def other(tmp_path):
 
 
 def test_a_second_process_is_refused_until_the_first_is_dead(other, tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(lock, "LOCK_TIMEOUT_S", 0.05)
     with pytest.raises(BadInput, match=rf"run: process {other.pid} on \S+ works in it; wait"), locked(tmp_path / "run"):
         pass
     assert lock_holder(tmp_path / "run").startswith(f"process {other.pid} on ")
     other.kill()
     other.wait()
-    assert lock_holder(tmp_path / "run") is None and (tmp_path / "run" / NAME).exists(), "killed, it leaves the file"
+    assert lock_holder(tmp_path / "run") is None and (tmp_path / "run" / LOCK_FILE).exists(), (
+        "killed, it leaves the file"
+    )
     with locked(tmp_path / "run"):
-        assert json.loads((tmp_path / "run" / NAME).read_text())["pid"] == os.getpid()
+        assert json.loads((tmp_path / "run" / LOCK_FILE).read_text())["pid"] == os.getpid()
 
 
 def test_an_empty_folder_does_not_stay(tmp_path):
     with pytest.raises(ValueError, match="on the way"), locked(tmp_path / "a" / "b"):
-        assert (tmp_path / "a" / "b" / NAME).exists()
+        assert (tmp_path / "a" / "b" / LOCK_FILE).exists()
         raise ValueError("on the way")
     assert not (tmp_path / "a").exists()
     with locked(tmp_path / "a" / "b"):
@@ -54,7 +56,7 @@ def test_an_empty_folder_does_not_stay(tmp_path):
 
 
 def test_a_lock_that_was_deleted_meanwhile_is_none(tmp_path, monkeypatch):
-    path, flock, calls = tmp_path / NAME, fcntl.flock, []
+    path, flock, calls = tmp_path / LOCK_FILE, fcntl.flock, []
 
     def slow(file, how):  # between our opening and our locking, the one before deletes its file
         calls.append(how)
@@ -83,7 +85,7 @@ def test_without_locks_there_is_a_note(tmp_path, monkeypatch):
 def test_what_is_not_our_file_stays_as_it_is(tmp_path, kind):
     out, mine = tmp_path / "run", tmp_path / "mine.txt"
     out.mkdir()
-    path, content = out / NAME, {"json": '{"pid": 1}', "nested": "[" * 4000}.get(kind, "my own text")
+    path, content = out / LOCK_FILE, {"json": '{"pid": 1}', "nested": "[" * 4000}.get(kind, "my own text")
     mine.write_text(content)
     if kind.startswith("link"):
         path.symlink_to(mine if kind == "link" else tmp_path / "new.txt")
@@ -101,15 +103,17 @@ def test_what_is_not_our_file_stays_as_it_is(tmp_path, kind):
 
 
 def test_a_file_called_lock_may_be_the_users(tmp_path):
-    (tmp_path / FORMER).write_text("mine")
+    (tmp_path / FORMER_LOCK_FILE).write_text("mine")
     with locked(tmp_path):
         assert lock_holder(tmp_path).startswith(f"process {os.getpid()} on ")
-    assert [path.name for path in tmp_path.iterdir()] == [FORMER] and (tmp_path / FORMER).read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == [FORMER_LOCK_FILE] and (
+        tmp_path / FORMER_LOCK_FILE
+    ).read_text() == "mine"
 
 
 def test_a_process_of_an_older_version_is_waited_for(tmp_path):
-    (tmp_path / FORMER).write_text('{"pid": 77, "host": "there"}')
-    with (tmp_path / FORMER).open("r+") as file:
+    (tmp_path / FORMER_LOCK_FILE).write_text('{"pid": 77, "host": "there"}')
+    with (tmp_path / FORMER_LOCK_FILE).open("r+") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert lock_holder(tmp_path) == "process 77 on there"
         with pytest.raises(BadInput, match="process 77 on there works in it; wait"), locked(tmp_path):

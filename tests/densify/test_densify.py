@@ -14,7 +14,7 @@ from surfkit.densify.base import Contribution, Densify, Filter, Policy, Signal, 
 from surfkit.primitives import Flat3D, Gaussian3D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing import check_policy
 from surfkit.train.stage import Stage
 
@@ -225,7 +225,7 @@ def test_flat_points_multiply_and_needles_of_three_axes_do_not():
 @pytest.mark.parametrize("primitive", [Flat3D(), Gaussian3D()])
 def test_every_primitive_multiplies_through_the_elongation_filter(primitive):
     draw = torch.Generator().manual_seed(0)
-    cloud = Cloud(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
+    cloud = SparsePoints(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
     points = Points.fresh(primitive.init(cloud, draw))
     points.params["scales"][:, :2] = torch.tensor([0.05, 0.03]).log()
     if points.params["scales"].shape[1] == 3:

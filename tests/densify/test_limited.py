@@ -10,12 +10,12 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component, components, plugins
-from surfkit.densify import ADC, CountCap, Limited
+from surfkit.densify import ADC, CountCap, PointCap
 from surfkit.densify.base import Densify, Step
 from surfkit.primitives import Gaussian3D
 from surfkit.primitives.edit import Edit, NewPoints, apply, merge
 from surfkit.primitives.points import Points
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing import check_component, check_densify, check_policy
 
 
@@ -70,7 +70,7 @@ def offered():
 
 def gaussians(count: int = N) -> Points:
     draw = torch.Generator().manual_seed(0)
-    cloud = Cloud(torch.rand(count, 3, generator=draw), torch.full((count, 3), 100, dtype=torch.uint8))
+    cloud = SparsePoints(torch.rand(count, 3, generator=draw), torch.full((count, 3), 100, dtype=torch.uint8))
     return Points.fresh(Gaussian3D().init(cloud, draw))
 
 
@@ -153,9 +153,9 @@ def test_every_densifier_can_be_limited(name):
 
 def test_one_with_a_limit_of_its_own_keeps_to_its_own_way():
     assert ADC().limited(50) == ADC(filters=(CountCap(50),))
-    assert Doubling().limited(50) == Limited(Doubling(), 50) and Doubling().most_points is None
-    assert Doubling().limited(50).limited(40) == Limited(Doubling(), 40)
-    assert Limited(ADC(filters=(CountCap(9),)), 50).most_points == 9
+    assert Doubling().limited(50) == PointCap(Doubling(), 50) and Doubling().most_points is None
+    assert Doubling().limited(50).limited(40) == PointCap(Doubling(), 40)
+    assert PointCap(ADC(filters=(CountCap(9),)), 50).most_points == 9
 
 
 def test_a_limited_densifier_is_saved_and_loaded():

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.densify import ADC, AbsGradient, CountCap, Limited, LossGradient, MatchedADC
+from surfkit.densify import ADC, AbsGradient, CountCap, LossGradient, MatchedADC, PointCap
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.edit import Edit, apply, merge
 from surfkit.primitives.points import Points
 from surfkit.runs.recipe import Recipe
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing import check
 from surfkit.testing.inputs import crowd
 from surfkit.train.stage import Stage
@@ -89,14 +89,14 @@ def test_windows_begin_anew_after_an_edit_and_opacities_are_reset():
 def test_it_needs_a_signal_of_absolute_gradients():
     fit = Recipe(primitive=Gaussian3D(), pretrain=Stage(densify=MatchedADC(), signal=AbsGradient()))
     fit.refuse_unfit()
-    for densify in (MatchedADC(), Limited(MatchedADC())):
+    for densify in (MatchedADC(), PointCap(MatchedADC())):
         with pytest.raises(BadInput, match="pretrain.densify: .* needs absolute pixel gradients.*loss-gradient"):
             replace(fit, pretrain=Stage(densify=densify, signal=LossGradient())).refuse_unfit()
 
 
 @pytest.mark.parametrize("primitive", [Gaussian3D(sh_degree=0), Surfel2D(sh_degree=0)])
 def test_scattered_copies_are_distributed_as_the_point_is(primitive):
-    params = primitive.init(Cloud(torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator())
+    params = primitive.init(SparsePoints(torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator())
     width = params["scales"].shape[1]
     params["scales"] = torch.tensor([0.3, 0.1, 0.02])[:width].log().repeat(2, 1)
     params["quats"] = torch.tensor([[0.8, 0.2, -0.4, 0.4], [1.0, 0, 0, 0]])

@@ -10,7 +10,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import rescale
-from surfkit.densify import ADC, Faint, Importance, Trim
+from surfkit.densify import ADC, PruneByImportance, PruneByOpacity, Trim
 from surfkit.densify.base import Contribution
 from surfkit.densify.prune import significance
 from surfkit.densify.trim import lowest, released_score, summed
@@ -95,9 +95,9 @@ def test_trims_at_given_steps_whatever_an_epoch_is(crowd):
     "policy",
     [
         Trim(start=1_000, until=2_000, every=300),
-        Importance(at=(0, 7, 1_200, 9_000)),
-        Faint(start=500, until=1_100, every=100),
-        Importance(at=(9_000,)),
+        PruneByImportance(at=(0, 7, 1_200, 9_000)),
+        PruneByOpacity(start=500, until=1_100, every=100),
+        PruneByImportance(at=(9_000,)),
         Trim(until=900),
     ],
 )
@@ -232,10 +232,10 @@ def test_importance_is_opacity_times_hits_times_a_power_of_the_area(crowd):
     opacities, scales = step.splats.opacities.double().numpy(), step.splats.scales.double().numpy()
     area = scales[:, 0] * scales[:, 1]
     score = COUNT.sum(0).numpy() * opacities * (area / np.sort(area)[::-1][180]) ** 0.1
-    drop = Importance(ratio=0.3).edit(points, step).drop
+    drop = PruneByImportance(ratio=0.3).edit(points, step).drop
     assert set(drop.nonzero().flatten().tolist()) == set(np.argsort(score, kind="stable")[:60].tolist())
-    assert Importance().edit(points, replace(step, index=15_001)) is None
-    assert rescale(Importance(at=(9_000, 15_000)), 0.1).at == (900, 1_500)
+    assert PruneByImportance().edit(points, replace(step, index=15_001)) is None
+    assert rescale(PruneByImportance(at=(9_000, 15_000)), 0.1).at == (900, 1_500)
 
 
 def test_significance_is_opacity_times_transmittance_times_a_power_of_the_clipped_area(crowd):
@@ -246,7 +246,7 @@ def test_significance_is_opacity_times_transmittance_times_a_power_of_the_clippe
     shown = (2 * AMOUNT * (COUNT > 0)).sum(0).double().numpy()
     score = [shown[n] * opacities[n] * share[n] ** 0.1 for n in range(200)]
     assert sum(value == 1 for value in share) == 20
-    drop = Importance(ratio=0.3, score="significance").edit(points, step).drop
+    drop = PruneByImportance(ratio=0.3, score="significance").edit(points, step).drop
     assert set(drop.nonzero().flatten().tolist()) == set(np.argsort(score, kind="stable")[:60].tolist())
     assert np.allclose(significance(step.views, step.splats, 0.1), score, rtol=1e-5)
 
@@ -271,7 +271,7 @@ def test_significance_counts_a_pixel_by_what_the_points_before_it_let_through():
 
 
 def test_faint_points_go_every_so_often(crowd):
-    policy = Faint(below=0.5, start=100, until=400, every=100, recovery=50)
+    policy = PruneByOpacity(below=0.5, start=100, until=400, every=100, recovery=50)
     points, step = crowd
     faint = replace(step.splats, opacities=torch.linspace(0, 1, 200))
     steps = [i for i in range(1, 600) if policy.edit(points, replace(step, index=i, splats=faint))]
@@ -283,8 +283,8 @@ def test_faint_points_go_every_so_often(crowd):
 
 @pytest.mark.parametrize(
     ("cls", "setting"),
-    [(Trim, {"ratio": 1.0}), (Trim, {"gamma": -0.1}), (Trim, {"every": 0}), (Importance, {"ratio": -1}),
-     (Faint, {"every": 0})],
+    [(Trim, {"ratio": 1.0}), (Trim, {"gamma": -0.1}), (Trim, {"every": 0}), (PruneByImportance, {"ratio": -1}),
+     (PruneByOpacity, {"every": 0})],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_refused(cls, setting):
     with pytest.raises(BadInput, match=next(iter(setting))):

@@ -15,7 +15,7 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
 from surfkit.depth import keep, prepare
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.depth.prepare import Preparation
+from surfkit.depth.prepare import DepthPreparation
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.fingerprint import fingerprint
 from surfkit.io.datasets.made_maps import folder_of, read_made
@@ -42,7 +42,7 @@ def made(data, budget=PLENTY, estimator=FAST):
     told = []
     scene = read(data)
     tracks = observations(data, scene)
-    preparation = Preparation(data, estimator, torch.device("cpu"))
+    preparation = DepthPreparation(data, estimator, torch.device("cpu"))
     with mock.patch.object(keep, "emit", told.append):
         with keep.maps(preparation, scene, tracks, "some", budget) as (folder, known):
             assert folder == folder_of("some")

@@ -7,7 +7,7 @@ import torch
 
 from surfkit.depth import neighbours as module
 from surfkit.depth.neighbours import neighbours
-from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.parallax import degrees_between, worth
 
 HEIGHT = 10.0
@@ -20,7 +20,7 @@ def compared(places, xyz, count=4, angle=12.0):
         SimpleNamespace(name=str(at), camera=SimpleNamespace(centre=torch.tensor(one)))
         for at, one in enumerate(centres)
     ]
-    seen = Seen(np.arange(len(xyz)), np.full((len(xyz), 2), 0.5))
+    seen = Observations2D(np.arange(len(xyz)), np.full((len(xyz), 2), 0.5))
     tracks = Observations(xyz, np.ones(len(xyz)), {view.name: seen for view in views})
     return neighbours(views, tracks, count, angle)
 
@@ -52,7 +52,7 @@ def test_angles_are_not_computed_where_places_tell_that_they_are_small(monkeypat
     apart, looked, real = HEIGHT * np.tan(np.radians(12)), [], module._worth
     monkeypatch.setattr(module, "_worth", lambda *words: looked.append(1) or real(*words))
     found = compared(np.array([[0, 0]] * 60 + [[apart, 0]]), points())
-    assert found[:60] == [[60]] * 60 and len(looked) == 60 + module.CANDIDATES
+    assert found[:60] == [[60]] * 60 and len(looked) == 60 + module.MAX_CANDIDATE_VIEWS
 
 
 def test_points_that_lie_nowhere_change_nothing():

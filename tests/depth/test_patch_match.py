@@ -10,10 +10,10 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
-from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
+from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve, pattern, way
 from surfkit.depth.neighbours import in_turn, neighbours
-from surfkit.depth.patch_match import PatchMatch, Work
-from surfkit.depth.plane_map import Map, load_map, save_map
+from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace
+from surfkit.depth.plane_map import PlaneMap, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import observations, read
@@ -23,7 +23,7 @@ from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 CPU = torch.device("cpu")
-STILL = Terms(0.1, 10, 1e-9, 0, 0, 0, 30, 2.5, samples=32, best=1, window=5, survey=True)
+STILL = MatchingSettings(0.1, 10, 1e-9, 0, 0, 0, 30, 2.5, samples=32, best=1, window=5, survey=True)
 """No plane is worth trying: they differ by too few pixels."""
 
 
@@ -73,7 +73,7 @@ def test_what_is_not_trusted_is_worse(farm, estimates):
     assert share[False] > 1.7 * share[True] > 0
 
 
-def two_pictures(seed: int) -> tuple[Grey, Grey]:
+def two_pictures(seed: int) -> tuple[GreyImage, GreyImage]:
     """Of noise, from two places, with lenses of their own."""
     draw = np.random.default_rng(seed)
     pose = torch.eye(4, dtype=torch.float64)
@@ -85,10 +85,12 @@ def two_pictures(seed: int) -> tuple[Grey, Grey]:
         Camera(torch.eye(4, dtype=torch.float64), 30.0, 32.0, 15.5, 11.0, 32, 24),
         Camera(pose, 34.0, 33.0, 18.0, 15.0, 38, 28),
     )
-    return tuple(Grey(c, draw.integers(0, 256, (c.height, c.width)).astype(np.uint8)) for c in cameras)
+    return tuple(GreyImage(c, draw.integers(0, 256, (c.height, c.width)).astype(np.uint8)) for c in cameras)
 
 
-def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms: Terms, gain: float = 1.0) -> float:
+def slow_cost(
+    here: GreyImage, there: GreyImage, x: int, y: int, plane: np.ndarray, terms: MatchingSettings, gain: float = 1.0
+) -> float:
     """1 - the weighted correlation of a window with its picture through a plane, and their brightness, by loops."""
     numbers = np.array(way(here.camera, there.camera))
     turn, shift = numbers[:9].reshape(3, 3), numbers[9:]
@@ -116,7 +118,7 @@ def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms:
     return float(min(max(0, 1 - (w * a) @ b / np.sqrt((w @ a**2 + 1) * (w @ b**2 + 1))) + unlike, 1))
 
 
-def slow_gain(here: Grey, there: Grey, planes: np.ndarray) -> float:
+def slow_gain(here: GreyImage, there: GreyImage, planes: np.ndarray) -> float:
     """Median ratio of grey values of every eighth pixel and what its plane shows, by loops."""
     numbers, ratios = np.array(way(here.camera, there.camera)), []
     for y in range(4, here.camera.height, 8):
@@ -161,10 +163,10 @@ def test_the_pixels_of_a_window_lie_around_its_middle(window):
 def test_pictures_upside_down_match_as_well(window):
     """No window is compared off its middle: turned by 180 degrees, both pictures give the same costs."""
 
-    def turned(grey: Grey) -> Grey:
+    def turned(grey: GreyImage) -> GreyImage:
         c, pose = grey.camera, torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
         lens = (c.fx, c.fy, c.width - c.cx, c.height - c.cy, c.width, c.height)
-        return Grey(Camera(pose @ c.world_to_camera, *lens), np.ascontiguousarray(grey.value[::-1, ::-1]))
+        return GreyImage(Camera(pose @ c.world_to_camera, *lens), np.ascontiguousarray(grey.value[::-1, ::-1]))
 
     pictures, found = two_pictures(3), []
     for here, there in (pictures, [turned(grey) for grey in pictures]):
@@ -180,12 +182,12 @@ def test_pictures_upside_down_match_as_well(window):
 def test_the_plane_of_another_pixel_is_taken(away):
     """By all kernels, whichever of the planes that are tried together is the right one."""
     value = np.random.default_rng(0).integers(0, 256, (24, 32)).astype(np.uint8)
-    here = Grey(Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 16.0, 12.0, 32, 24), value)
+    here = GreyImage(Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 16.0, 12.0, 32, 24), value)
     others = []
     for axis in (0, 1):  # inverse depth 0.5 moves two pixels to the right, or down
         pose = torch.eye(4, dtype=torch.float64)
         pose[axis, 3] = 2 / (30 * 0.5)
-        others.append(Grey(replace(here.camera, world_to_camera=pose), np.roll(value, 2, axis=1 - axis)))
+        others.append(GreyImage(replace(here.camera, world_to_camera=pose), np.roll(value, 2, axis=1 - axis)))
     x, y = 16 + away[0], 12 + away[1]
     terms = replace(STILL, parallax=4.0)
     rows, columns = np.mgrid[:24, :32]
@@ -205,9 +207,9 @@ def test_a_plane_costs_the_soft_minimum_of_its_views():
     """Of pictures that all become brighter to the right, with more and more noise."""
     draw = np.random.default_rng(5)
 
-    def bright(camera: Camera, noise: float) -> Grey:
+    def bright(camera: Camera, noise: float) -> GreyImage:
         shown = 5 * np.arange(camera.width) + draw.normal(20, noise, (camera.height, camera.width))
-        return Grey(camera, shown.clip(0, 255).astype(np.uint8))
+        return GreyImage(camera, shown.clip(0, 255).astype(np.uint8))
 
     here, there = (grey.camera for grey in two_pictures(0))
     here, others = bright(here, 4), [bright(there, noise) for noise in (4, 10, 30)]
@@ -229,21 +231,21 @@ def test_repeated_texture_is_told_apart_by_its_brightness():
     draw = np.random.default_rng(4)
     shape, lens = (48, 64), (40.0, 40.0, 32.0, 24.0, 64, 48)
 
-    def seen(right: float, exposure: float) -> Grey:
+    def seen(right: float, exposure: float) -> GreyImage:
         pose = torch.eye(4, dtype=torch.float64)
         pose[0, 3] = -right
         y, x = np.mgrid[:48, :64]
         x = x + 40 * right * 0.5  # of inverse depth 0.5
         waves = np.sin(2 * np.pi * x / 8) + np.sin(2 * np.pi * y / 7)
         shown = 40 + 1.5 * x + 15 * waves + draw.normal(0, 1, shape)
-        return Grey(Camera(pose, *lens), (exposure * shown).round().clip(0, 255).astype(np.uint8))
+        return GreyImage(Camera(pose, *lens), (exposure * shown).round().clip(0, 255).astype(np.uint8))
 
     def right(brightness: float, exposure: float) -> float:
         """Share of the pixels in the middle, which begin a wave off, whose planes are right after some passes."""
         others = [seen(to, exposure) for to in (0.4, -0.4)]
         planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
         planes.value[12:-12, 22:-22, 0] = 1
-        terms = Terms(0.1, 1.2, 16, 1, 0.015, 0, 15, brightness, samples=32, best=2, window=7, survey=False)
+        terms = MatchingSettings(0.1, 1.2, 16, 1, 0.015, 0, 15, brightness, samples=32, best=2, window=7, survey=False)
         for index in range(6):
             improve(seen(0, 1), others, planes, replace(terms, survey=index == 0), seed=index)
         return float((16 * np.abs(planes.value[14:-14, 24:-24, 0] - 0.5) < 1).mean())
@@ -259,14 +261,14 @@ def test_passes_do_not_lose_what_is_right_where_noise_is_all_that_differs():
     shape, lens = (48, 64), (40.0, 40.0, 32.0, 24.0, 64, 48)
     surface = draw.normal(128, 0.5, shape)
 
-    def seen(right: float) -> Grey:
+    def seen(right: float) -> GreyImage:
         pose = torch.eye(4, dtype=torch.float64)
         pose[0, 3] = -right
         shown = np.roll(surface, -round(40 * right * 0.5), 1) + draw.normal(0, 1.5, shape)
-        return Grey(Camera(pose, *lens), shown.round().astype(np.uint8))
+        return GreyImage(Camera(pose, *lens), shown.round().astype(np.uint8))
 
     planes = Planes.at(np.full(shape, 0.5, np.float32), 4)
-    terms = Terms(0.1, 1, 20, 1, 0.015, 0, 15, 2.5, samples=32, best=3, window=7, survey=False)
+    terms = MatchingSettings(0.1, 1, 20, 1, 0.015, 0, 15, 2.5, samples=32, best=3, window=7, survey=False)
     others = [seen(right) for right in (0.25, 0.5, -0.25, -0.5)]
     ours = seen(0)
     for index in range(8):
@@ -291,7 +293,7 @@ def test_a_window_of_which_nothing_counts_matches_nothing():
     here, there = two_pictures(0)
     dark = np.zeros_like(here.value)
     dark[4::9, 4::9] = 255
-    here, terms = Grey(here.camera, dark), replace(STILL, spread=255 * 1e-4, samples=16, window=7)
+    here, terms = GreyImage(here.camera, dark), replace(STILL, spread=255 * 1e-4, samples=16, window=7)
     assert not (pattern(7)[:2, :16] == 0).all(0).any()
     for kernels in module().kernels():
         module().use_kernels(kernels)
@@ -360,12 +362,12 @@ def test_a_plane_counts_in_the_views_that_match_it_best():
     ours = draw.integers(60, 190, (40, 64)).astype(np.uint8)
     lens = (40.0, 40.0, 32.0, 20.0, 64, 40)
 
-    def moved(right: float, inverse: float, noise: float) -> Grey:
+    def moved(right: float, inverse: float, noise: float) -> GreyImage:
         """Seen from a place to the right, all at one depth."""
         pose = torch.eye(4, dtype=torch.float64)
         pose[0, 3] = -right
         shown = np.roll(ours, -round(40 * right * inverse), 1) + draw.normal(0, noise, ours.shape)
-        return Grey(Camera(pose, *lens), shown.clip(0, 255).astype(np.uint8))
+        return GreyImage(Camera(pose, *lens), shown.clip(0, 255).astype(np.uint8))
 
     front, behind = 0.8, 0.4
     others = [moved(right, front, 25) for right in (0.25, 0.5, -0.25)]
@@ -373,9 +375,9 @@ def test_a_plane_counts_in_the_views_that_match_it_best():
     planes = Planes.at(np.full(ours.shape, front, np.float32), 6)
     planes.each[..., :3], planes.each[..., 3:] = 60, 250
     planes.value[:, 30:34, 0] = behind
-    terms = Terms(0.1, 2, 14, 0, 0.001, 0, 30, 2.5, samples=32, best=3, window=7, survey=False)
+    terms = MatchingSettings(0.1, 2, 14, 0, 0.001, 0, 30, 2.5, samples=32, best=3, window=7, survey=False)
     for index in range(6):
-        improve(Grey(Camera(torch.eye(4, dtype=torch.float64), *lens), ours), others, planes, terms, seed=index)
+        improve(GreyImage(Camera(torch.eye(4, dtype=torch.float64), *lens), ours), others, planes, terms, seed=index)
     inner = planes.value[8:-8, 16:-16, 0]
     assert (np.abs(inner - behind) < 0.02).mean() > 0.95
 
@@ -383,12 +385,12 @@ def test_a_plane_counts_in_the_views_that_match_it_best():
 def test_fewer_large_pictures_are_kept_in_memory(farm, tmp_path):
     scene, tracks, _ = farm
     given, pairs = DepthInput(scene.train, tracks, CPU, tmp_path), [[1, 2, 3], *[[0]] * 19]
-    assert Work(PatchMatch(), given, pairs, []).room() == 48
+    assert PatchMatchWorkspace(PatchMatch(), given, pairs, []).room() == 48
     large = [replace(view, camera=view.camera.resized(4000, 3000)) for view in scene.train]
-    kept = Work(PatchMatch(longest=4000), replace(given, views=large), pairs, []).room()
+    kept = PatchMatchWorkspace(PatchMatch(longest=4000), replace(given, views=large), pairs, []).room()
     assert 5 < kept < 12 and kept * (7 + 4 * 3) * 12e6 <= 2**31
     huge = [replace(view, camera=view.camera.resized(20_000, 15_000)) for view in scene.train]
-    assert Work(PatchMatch(longest=20_000), replace(given, views=huge), pairs, []).room() == 5
+    assert PatchMatchWorkspace(PatchMatch(longest=20_000), replace(given, views=huge), pairs, []).room() == 5
 
 
 @pytest.mark.parametrize("setting", ["brightness", "smoothness", "consistency"])
@@ -399,7 +401,7 @@ def test_each_cost_that_is_set_decides_about_maps(farm, tmp_path, setting):
     def inverse(name: str, estimator: PatchMatch) -> torch.Tensor:
         (tmp_path / name).mkdir()
         given = DepthInput(scene.train, tracks, CPU, tmp_path / name)
-        return Work(estimator, given, pairs, [0]).last.map(0).inverse
+        return PatchMatchWorkspace(estimator, given, pairs, [0]).last.map(0).inverse
 
     as_set = inverse("set", PatchMatch(rounds=1, passes=1))
     other = inverse("other", PatchMatch(rounds=1, passes=1, **{setting: getattr(PatchMatch(), setting) / 2}))
@@ -439,9 +441,11 @@ def test_photographs_are_estimated_beside_those_that_they_are_compared_with():
 def test_photographs_are_made_smaller_once(farm, tmp_path, monkeypatch):
     """Also where no more of them stay in memory than one is compared with, at any size."""
     scene, tracks, _ = farm
-    made, halved = [], Work.halved
-    monkeypatch.setattr(Work, "halved", lambda self, level, at: made.append((level, at)) or halved(self, level, at))
-    monkeypatch.setattr(patch_match, "KEPT", 1)
+    made, halved = [], PatchMatchWorkspace.halved
+    monkeypatch.setattr(
+        PatchMatchWorkspace, "halved", lambda self, level, at: made.append((level, at)) or halved(self, level, at)
+    )
+    monkeypatch.setattr(patch_match, "MAX_CACHED_PICTURES", 1)
     views = scene.train[:6]
     settings = PatchMatch(longest=120, coarsest=32, passes=1, rounds=1, neighbours=5)
     list(settings.estimate(DepthInput(views, tracks, CPU, tmp_path), range(6)))
@@ -474,9 +478,9 @@ def test_planes_go_on_at_another_size():
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1), (3, 3)])
 def test_pictures_of_a_few_pixels_are_no_trouble(shape):
     camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
-    grey = Grey(camera, np.full(shape, 128, np.uint8))  # and without texture
+    grey = GreyImage(camera, np.full(shape, 128, np.uint8))  # and without texture
     planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
-    terms = Terms(0.1, 2, 10, 1, 0.01, 0, 30, 2.5, samples=16, best=1, window=7, survey=True)
+    terms = MatchingSettings(0.1, 2, 10, 1, 0.01, 0, 30, 2.5, samples=16, best=1, window=7, survey=True)
     improve(grey, [grey, grey], planes, terms, seed=1)
     assert np.isfinite(planes.value).all() and np.isfinite(planes.cost).all()
 
@@ -484,7 +488,7 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (3, 4)])
 def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape, tmp_path):
     draw = np.random.default_rng(6)
-    made = Map(draw.random((*shape, 3), np.float32), draw.integers(0, 256, (*shape, 5)).astype(np.uint8), 7.5)
+    made = PlaneMap(draw.random((*shape, 3), np.float32), draw.integers(0, 256, (*shape, 5)).astype(np.uint8), 7.5)
     save_map(tmp_path / "a", made)
     read = load_map(tmp_path / "a")
     np.testing.assert_array_equal(read.inverse, made.value[..., 0])

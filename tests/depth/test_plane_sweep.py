@@ -9,8 +9,8 @@ from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
-from surfkit.depth.consistency import Agreement, agreement, agreement_in_torch, at_edge
-from surfkit.depth.matching import Picture, cost_volume, ray_map
+from surfkit.depth.consistency import DepthConsistency, agreement, agreement_in_torch, at_edge
+from surfkit.depth.matching import PosedImage, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -96,7 +96,7 @@ def test_cost_is_one_minus_the_correlation_of_windows():
     draw = np.random.default_rng(0)
     light, other = draw.random((9, 11)), draw.random((9, 11))
     camera = Camera(torch.eye(4, dtype=torch.float64), 10.0, 10.0, 5.5, 4.5, 11, 9)
-    here, there = (Picture(camera, torch.from_numpy(values).float()[None]) for values in (light, other))
+    here, there = (PosedImage(camera, torch.from_numpy(values).float()[None]) for values in (light, other))
     volume = cost_volume(here, [there], torch.tensor([1.0, 2.0]), 3, 0.5)
     for y, x in ((1, 1), (4, 6), (7, 9)):
         a, b = (values[y - 1 : y + 2, x - 1 : x + 2].ravel() for values in (light, other))
@@ -107,8 +107,8 @@ def test_cost_is_one_minus_the_correlation_of_windows():
 def test_the_best_part_of_the_neighbours_counts():
     draw = torch.Generator().manual_seed(0)
     camera = Camera(torch.eye(4, dtype=torch.float64), 10.0, 10.0, 8.0, 8.0, 16, 16)
-    here = Picture(camera, torch.rand(3, 16, 16, generator=draw))
-    occluded = [Picture(camera, torch.rand(3, 16, 16, generator=draw)) for _ in range(2)]
+    here = PosedImage(camera, torch.rand(3, 16, 16, generator=draw))
+    occluded = [PosedImage(camera, torch.rand(3, 16, 16, generator=draw)) for _ in range(2)]
     planes = torch.ones(3)
     assert cost_volume(here, [occluded[0], here, occluded[1], here], planes, 5, 0.5).amax() < 0.05
     assert cost_volume(here, [occluded[0], here, occluded[1], here], planes, 5, 1.0).mean() > 0.3
@@ -194,7 +194,7 @@ def test_trust_asks_for_two_maps_at_least_and_for_no_more_than_show_the_place():
     count = torch.tensor([0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 4.0])
     shown = torch.tensor([0.0, 1.0, 2.0, 2.0, 5.0, 5.0, 4.0])
     wanted = torch.tensor([0, 1 / 2, 1 / 2, 1, 2 / 3, 1, 1])
-    torch.testing.assert_close(Agreement(count, shown, count).trust(3), wanted)
+    torch.testing.assert_close(DepthConsistency(count, shown, count).trust(3), wanted)
 
 
 def test_edges_are_told_from_slopes():

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from surfkit.evaluate.geometry import comparison
 from surfkit.evaluate.geometry.comparison import Comparison, compare, warn_of_loss
 from surfkit.evaluate.geometry.scores import shares
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.scene.crop import Crop, write_crop
 
@@ -33,7 +33,7 @@ def town(seed, side=100.0, count=8_000, low=0.0):
 
 
 def cloud(points):
-    return Surface("given", points)
+    return SurfaceFile("given", points)
 
 
 def measured(ours, truth, **settings):

@@ -13,9 +13,9 @@ from surfkit.evaluate.geometry.class_pictures import write_classes
 from surfkit.evaluate.geometry.classes import SEEN_FROM, class_figures, classify
 from surfkit.evaluate.geometry.comparison import Comparison, compare
 from surfkit.evaluate.geometry.normals import normals_at
-from surfkit.evaluate.geometry.repetition import Side
+from surfkit.evaluate.geometry.repetition import ComparedSurface
 from surfkit.evaluate.geometry.sightings import near_edges, sightings
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
 from surfkit.evaluate.geometry.terrain import terrain
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.seams import Seams
@@ -60,7 +60,7 @@ def town(slope=0.0, widened=0.0, walls=True):
 
 
 def mesh(triangles):
-    return Surface("town", triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+    return SurfaceFile("town", triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 
 def exact_class(points, slope=0.0):
@@ -191,7 +191,7 @@ def test_a_hill_is_ground_and_a_table_is_not():
 def test_classes_by_views_are_those_of_exact_rays():
     scene = photograph(Flight(views=10, width=128, height=96, test_every=0)).scene
     points = synthetic_points(60_000)
-    cloud = Surface("points", points)
+    cloud = SurfaceFile("points", points)
     settings = Comparison(crop="none", align="none", draws=1, tau=0.2)
     outcome = compare(cloud, cloud, settings)
     views = classify(outcome, settings, scene.train, scene.frame).groups[1]
@@ -254,7 +254,7 @@ def test_normals(tmp_path, kind):
     ball = trimesh.creation.icosphere(5, 2.0)
     points = np.asarray(ball.vertices)
     if kind == "faces":
-        side = Side(Surface("ball", points, np.asarray(ball.faces)), None, 40_000)
+        side = ComparedSurface(SurfaceFile("ball", points, np.asarray(ball.faces)), None, 40_000)
     elif kind == "file":
         rows = np.zeros(len(points), [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")])
         for i, axis in enumerate("xyz"):
@@ -264,9 +264,9 @@ def test_normals(tmp_path, kind):
         head += [f"property float {name}" for name in rows.dtype.names] + ["end_header", ""]
         (tmp_path / "ball.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
         assert read_vertices(tmp_path / "ball.ply")[0].dtype.names[3] == "nx"
-        side = Side(read_surface(tmp_path / "ball.ply"), points, len(points))
+        side = ComparedSurface(read_surface(tmp_path / "ball.ply"), points, len(points))
     else:
-        side = Side(Surface("ball", points), points, len(points))
+        side = ComparedSurface(SurfaceFile("ball", points), points, len(points))
     places = points[::7] * 1.01
     found = normals_at(side, places, points, np.random.default_rng(0))
     assert np.allclose(np.linalg.norm(found, axis=1), 1)

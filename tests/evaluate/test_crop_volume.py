@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.comparison import usual_visible
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.evaluate.geometry.visibility import visible, visible_counts
 from surfkit.evaluate.geometry.volume import CropSettings, heightened, outside_shares, visible_crop
 from surfkit.scene.camera import Camera
@@ -222,14 +222,14 @@ def test_a_volume_reaches_as_far_as_the_reconstruction(axis):
 
     parts = [level(1.0), level(-1.0), level(4.0), level(500.0), level(-9.0, left=20.0)]
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    mesh = Surface("given", np.concatenate(parts), np.concatenate([faces + 4 * at for at in range(len(parts))]))
+    mesh = SurfaceFile("given", np.concatenate(parts), np.concatenate([faces + 4 * at for at in range(len(parts))]))
     found = heightened(crop, mesh, np.eye(4), 0.25)
     assert (found.low, found.high) == (-1.25, 4.25) and found.axis == axis
-    assert heightened(crop, Surface("given", level(1.0), faces), np.eye(4), 0.25) == crop
+    assert heightened(crop, SurfaceFile("given", level(1.0), faces), np.eye(4), 0.25) == crop
     fifth = pytest.approx(0.2)
     assert outside_shares(mesh, np.eye(4), found) == {"above": fifth, "below": 0, "beside": fifth}
     assert outside_shares(mesh, np.eye(4), crop) == {"above": pytest.approx(0.4), "below": fifth, "beside": fifth}
-    cloud = Surface("given", mesh.rows)
+    cloud = SurfaceFile("given", mesh.rows)
     assert outside_shares(cloud, np.eye(4), crop) == {"above": pytest.approx(0.4), "below": fifth, "beside": fifth}
     up = np.eye(4)
     up["xyz".index(axis), 3] = 5.0

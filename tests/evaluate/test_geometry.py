@@ -17,7 +17,7 @@ from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.repetition import cloud_side
 from surfkit.evaluate.geometry.sampling import face_areas, sample_faces
 from surfkit.evaluate.geometry.scores import shares
-from surfkit.evaluate.geometry.surface import Surface, part_within, read_surface
+from surfkit.evaluate.geometry.surface import SurfaceFile, part_within, read_surface
 from surfkit.evaluate.geometry.transform import apply, write_transform
 from surfkit.io.splats.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop
@@ -33,7 +33,7 @@ def lattice(shift=(0, 0, 0), side=60, step=0.1):
 
 
 def surface(points, faces=None):
-    return Surface("given", np.asarray(points, float), faces)
+    return SurfaceFile("given", np.asarray(points, float), faces)
 
 
 def still(**others):
@@ -51,7 +51,7 @@ GLOBE = surface(BALL.vertices, np.asarray(BALL.faces))
 @pytest.fixture
 def only_given(monkeypatch):
     """Nothing is aligned: that is most of a comparison."""
-    monkeypatch.setattr(comparison, "WAYS", ("none",))
+    monkeypatch.setattr(comparison, "ALIGNMENTS", ("none",))
 
 
 @pytest.mark.parametrize("align", ["none", "rigid", "similarity"])
@@ -114,7 +114,7 @@ def test_a_coarse_mesh_gets_enough_samples():
 @pytest.mark.parametrize("far", ["reconstruction", "truth", "both"])
 def test_a_large_triangle_far_away_takes_no_samples(tmp_path, monkeypatch, told, far):
     """Half a square is there: recall 1/2, whatever lies beyond the crop volume, and however large."""
-    monkeypatch.setattr(repetition, "MOST", 60_000)
+    monkeypatch.setattr(repetition, "MAX_COMPARED_POINTS", 60_000)
     sky = [[-1e5, -1e5, 500], [1e5, -1e5, 500], [0, 2e5, 500], [2.6, -7e4, 0], [9e4, 0, 0], [2.6, 7e4, 0]]
 
     def mesh(width, beyond):
@@ -189,7 +189,7 @@ def test_a_given_transform_and_crop(tmp_path):
 
 
 def test_a_large_cloud_is_thinned_while_it_is_read(monkeypatch):
-    monkeypatch.setattr(repetition, "MOST", 1_000)
+    monkeypatch.setattr(repetition, "MAX_COMPARED_POINTS", 1_000)
     found = cloud_side(surface(lattice(side=200)), None)
     assert 300 < len(found.cloud) < 3_000 and found.voxel > 0.3
     assert len(cloud_side(surface(lattice(side=20)), None).cloud) == 400

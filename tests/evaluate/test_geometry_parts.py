@@ -13,7 +13,7 @@ from surfkit.evaluate.geometry import thinning
 from surfkit.evaluate.geometry.registration import align
 from surfkit.evaluate.geometry.sampling import sample_surface
 from surfkit.evaluate.geometry.scores import Distances, chamfer, curve, nearest, shares, spacing, surface_gap, tree
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, fitted, read_transform, scale_of, write_transform
 
@@ -25,7 +25,7 @@ def rng(seed=0):
 
 
 def mesh_of(shape):
-    return Surface("mesh", np.asarray(shape.vertices), np.asarray(shape.faces))
+    return SurfaceFile("mesh", np.asarray(shape.vertices), np.asarray(shape.faces))
 
 
 def test_samples_lie_on_the_surface_in_proportion_to_area():
@@ -51,7 +51,7 @@ def test_samples_are_even_and_seeded():
 
 def test_a_mesh_of_lines_has_no_area():
     with pytest.raises(BadInput, match="no area"):
-        sample_surface(Surface("flat.ply", np.zeros((3, 3)), np.array([[0, 1, 2]])), 10, rng())
+        sample_surface(SurfaceFile("flat.ply", np.zeros((3, 3)), np.array([[0, 1, 2]])), 10, rng())
 
 
 def test_thinning_is_the_mean_of_each_voxel_whatever_the_blocks(monkeypatch):
@@ -173,10 +173,10 @@ def test_icp_as_open3d_does_one_round():
     criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, 20)
     way = registration.TransformationEstimationPointToPoint(True)
     theirs = registration.registration_icp(source, target, 0.3, mean_ssim(1.02), way, criteria)
-    from surfkit.evaluate.geometry.registration import Alignment, icp
+    from surfkit.evaluate.geometry.registration import IcpResult, icp
 
     points = np.asarray(target.points)
-    start = Alignment(mean_ssim(1.02), 0, None)
+    start = IcpResult(mean_ssim(1.02), 0, None)
     ours = icp(np.asarray(source.points), tree(points), points, start, 0.3, True)
     assert ours.residual == pytest.approx(theirs.inlier_rmse, rel=1e-3)
     assert np.abs(ours.matrix - theirs.transformation).max() < 2e-3

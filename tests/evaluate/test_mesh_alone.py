@@ -8,7 +8,7 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
 from surfkit.evaluate.mesh import boxes as cubes
 from surfkit.evaluate.mesh import crossing, roughness
 from surfkit.evaluate.mesh.boxes import boxes
@@ -24,7 +24,7 @@ open3d = needs("open3d")
 
 
 def surface(mesh, offset=(0.0, 0.0, 0.0), kind=np.float64):
-    return Surface(Path("mesh.obj"), np.array(mesh.vertices, kind), np.array(mesh.faces, np.int32), offset)
+    return SurfaceFile(Path("mesh.obj"), np.array(mesh.vertices, kind), np.array(mesh.faces, np.int32), offset)
 
 
 def whole(mesh):
@@ -105,7 +105,7 @@ def test_faces_without_area():
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]], [[0, 1, 2], [0, 1, 3]], process=False)
     assert measure_mesh(surface(flat)).figures["degenerate"] == 1
     with pytest.raises(BadInput, match="no area"):
-        whole_mesh(Surface(Path("mesh.obj"), np.zeros((3, 3)), np.array([[0, 1, 2]])))
+        whole_mesh(SurfaceFile(Path("mesh.obj"), np.zeros((3, 3)), np.array([[0, 1, 2]])))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -132,13 +132,13 @@ def test_cubes_find_the_share_of_the_whole(monkeypatch):
     mesh.vertices[:, 2] += 0.05 * np.sin(37 * mesh.vertices[:, 0]) * np.where(mesh.vertices[:, 0] < 5, 1, 0)
     told = whole(mesh)
     every = crossing_faces(told, np.arange(len(told.faces)))
-    monkeypatch.setattr(crossing, "WHOLE", 1000)
-    monkeypatch.setattr(crossing, "IN_BOX", 200)
+    monkeypatch.setattr(crossing, "MAX_WHOLE_TRIANGLES", 1000)
+    monkeypatch.setattr(crossing, "TRIANGLES_PER_CUBE", 200)
     found = crossings(told)
     assert 0.1 < every.mean() < 0.9 and 2000 < found.measured < 20_000 and found.boxes > 10
     assert found.share == pytest.approx(every.mean(), abs=0.05)
     judged = 0
-    for box in boxes(told, found.side, cubes.by_number(told, crossing.BOXES)):
+    for box in boxes(told, found.side, cubes.by_number(told, crossing.SAMPLED_CUBES)):
         within = box.has(told.corners(box.faces)).all(1)
         own = crossing_faces(told, box.faces)
         assert np.array_equal(own[within], every[box.faces[within]])
@@ -148,7 +148,7 @@ def test_cubes_find_the_share_of_the_whole(monkeypatch):
 
 @pytest.mark.parametrize("block", [1 << 20, 50])
 def test_cubes_have_all_faces_that_reach_into_them(monkeypatch, block):
-    monkeypatch.setattr(cubes, "BLOCK", block)
+    monkeypatch.setattr(cubes, "BLOCK_POINTS", block)
     told = whole(balls(0))
     corners = told.corners(slice(None))
     for margin in (0.0, 0.2):

@@ -15,7 +15,7 @@ from surfkit.evaluate.geometry.highest import highest
 from surfkit.evaluate.geometry.las import read_las
 from surfkit.evaluate.geometry.place import same_plan
 from surfkit.evaluate.geometry.sampling import face_areas
-from surfkit.evaluate.geometry.surface import Surface, read_surface, system_of
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface, system_of
 from surfkit.io.splats.ply import write_points
 
 trimesh = needs("trimesh")
@@ -72,7 +72,7 @@ def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, told):
     xyz = np.random.default_rng(0).normal(size=(1000, 3))
     xyz[[3, 700]] = np.nan
     write_points(tmp_path / "cloud.ply", xyz, np.zeros((1000, 3), np.uint8))
-    monkeypatch.setattr(surface, "BLOCK", 300)
+    monkeypatch.setattr(surface, "BLOCK_POINTS", 300)
     blocks = list(read_surface(tmp_path / "cloud.ply").blocks())
     assert [len(block) for block in blocks] == [299, 300, 299, 100]
     assert np.array_equal(np.concatenate(blocks), xyz[np.isfinite(xyz).all(1)])
@@ -216,7 +216,7 @@ def test_laser_scans_are_clouds(tmp_path, name, told, monkeypatch):
     found = read_surface(tmp_path / name)
     assert found.faces is None and np.abs(found.vertices() - PLACES).max() < 1e-3
     assert system_of(tmp_path / name) == "EPSG:32633" and not told
-    monkeypatch.setattr("surfkit.evaluate.geometry.las.AT_ONCE", 300)
+    monkeypatch.setattr("surfkit.evaluate.geometry.las.CHUNK_POINTS", 300)
     xyz, rgb, _ = read_las(tmp_path / name, 900)
     assert np.abs(xyz - PLACES[::3]).max() < 1e-3 and rgb is None
     assert len(told) == 1 and "667 of 2,000 points are used" in told[0]
@@ -275,7 +275,7 @@ def test_the_highest_points_of_a_cloud_are_a_surface():
     plan = draw.uniform(0, 30, (20_000, 2))
     ground = np.column_stack([plan, 0.1 * plan[:, 0]])
     roof = np.column_stack([10 + draw.uniform(0, 10, (30_000, 2)), np.full(30_000, 8.0)])
-    found = highest(Surface(Path("given"), np.concatenate([ground, roof]) + [400_000, 0, 0]))
+    found = highest(SurfaceFile(Path("given"), np.concatenate([ground, roof]) + [400_000, 0, 0]))
     xyz = found.vertices() - [400_000, 0, 0]
     inner = (np.abs(xyz[:, :2] - 15) < 4.5).all(1)
     outer = (np.abs(xyz[:, :2] - 15) > 6).any(1)

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.evaluate.images import view_counts
 from surfkit.evaluate.images.parts import by_views, measure_parts
-from surfkit.evaluate.images.view_counts import Depths, count_views
+from surfkit.evaluate.images.view_counts import DepthSource, count_views
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
@@ -47,7 +47,7 @@ def brute(view):
 
 @pytest.mark.parametrize("through", [True, False])
 def test_counts_are_those_of_exact_rays(through):
-    found = list(count_views(SCENE.held_out, SCENE.train, Depths(exact_depth, "exact", 0.01, through)))
+    found = list(count_views(SCENE.held_out, SCENE.train, DepthSource(exact_depth, "exact", 0.01, through)))
     assert [sight.view.name for sight in found] == [view.name for view in SCENE.held_out]
     for sight in found:
         counts, known = brute(sight.view)
@@ -66,7 +66,7 @@ def test_rendered_depth_that_disagrees_does_not_see():
         return exact_depth(view) * (9.0 if view.name in wrong else 1.0)
 
     def counts(train, through):
-        return next(iter(count_views(SCENE.held_out[:1], train, Depths(depth_of, "", 0.01, through)))).counts
+        return next(iter(count_views(SCENE.held_out[:1], train, DepthSource(depth_of, "", 0.01, through)))).counts
 
     right = SCENE.train[3:]
     assert torch.equal(counts(SCENE.train, False), counts(right, False))
@@ -74,12 +74,14 @@ def test_rendered_depth_that_disagrees_does_not_see():
 
 
 def test_batches_do_not_change_what_is_found(monkeypatch):
-    depths = Depths(exact_depth, "exact", 0.01, False)
+    depths = DepthSource(exact_depth, "exact", 0.01, False)
     whole = list(count_views(SCENE.held_out, SCENE.train, depths))
-    monkeypatch.setattr(view_counts, "BYTES", 1)
+    monkeypatch.setattr(view_counts, "BATCH_BYTES", 1)
     asked = []
     parts = list(
-        count_views(SCENE.held_out, SCENE.train, Depths(lambda v: asked.append(v) or exact_depth(v), "", 0.01, False))
+        count_views(
+            SCENE.held_out, SCENE.train, DepthSource(lambda v: asked.append(v) or exact_depth(v), "", 0.01, False)
+        )
     )
     assert all(torch.equal(a.counts, b.counts) for a, b in zip(whole, parts, strict=True))
     assert len(asked) == len(SCENE.held_out) * (1 + len(SCENE.train))
@@ -87,7 +89,7 @@ def test_batches_do_not_change_what_is_found(monkeypatch):
 
 def test_figures_of_parts():
     """A render that is wrong by 0.1 wherever fewer than 5 views look."""
-    depths = Depths(exact_depth, "exact", 0.01, False)
+    depths = DepthSource(exact_depth, "exact", 0.01, False)
     counts = {sight.view.name: sight.counts for sight in count_views(SCENE.held_out, SCENE.train, depths)}
     photos = {view.name: torch.full((3, 240, 320), 102, dtype=torch.uint8) for view in SCENE.held_out}
 
@@ -119,7 +121,7 @@ def test_large_photographs_are_looked_at_smaller():
         assert small.camera.width == 800
         return torch.ones(small.camera.height, small.camera.width)
 
-    sight = next(iter(count_views([large], [large], Depths(depth_of, "", 0.01, False))))
+    sight = next(iter(count_views([large], [large], DepthSource(depth_of, "", 0.01, False))))
     assert sight.counts.shape == (600, 800) and (sight.counts == 1).all()
     half = torch.zeros(600, 800, dtype=torch.bool)
     half[:, :400] = True

@@ -14,7 +14,7 @@ from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 from surfkit.testing.synthetic import Flight, photograph
 
 SIZE = (11, 14)
@@ -91,7 +91,7 @@ def test_rendered_surfels_that_lie_in_the_surface_agree_with_exact_normals():
         normals.append((rotation.T @ truth.normal[:, there]).T)
     xyz, normals = (torch.cat(parts).float() for parts in (xyz, normals))
     primitive = Surfel2D(sh_degree=0)
-    params = primitive.init(Cloud(xyz, torch.zeros(len(xyz), 3, dtype=torch.uint8), normals), torch.Generator())
+    params = primitive.init(SparsePoints(xyz, torch.zeros(len(xyz), 3, dtype=torch.uint8), normals), torch.Generator())
     params["opacities"].fill_(4.0)
     view, truth = views[2], exact[views[2].name]
     maps = select("cpu")[0].render(primitive.activate(params, 0), view.camera, 0.005).maps

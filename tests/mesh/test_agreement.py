@@ -10,7 +10,7 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import native, tsdf
-from surfkit.mesh.agreement import Agreement, compare, compare_in_torch
+from surfkit.mesh.agreement import GeometricConsistency, compare, compare_in_torch
 from surfkit.mesh.overlap import Depths, nearby, overlapping
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
@@ -20,7 +20,7 @@ from surfkit.scene.scene import View
 from .shapes import around, look_at, maps_of, seen, sphere, subject
 from .test_tsdf import cut_in_eight, faces_by_place
 
-TRUST = Agreement()
+TRUST = GeometricConsistency()
 
 
 def wall(points):
@@ -205,16 +205,16 @@ def test_alpha_spread_and_priors_tell():
     expected[1] = 2.1
     maps = Maps(None, alpha, alpha * expected, depth)
     assert not TRUST.within(maps, depth, None)[0].any() and (TRUST.within(maps, depth, None)[1:] == 1).all()
-    spread = Agreement(spread=0.05).within(maps, depth, None)
+    spread = GeometricConsistency(spread=0.05).within(maps, depth, None)
     assert torch.allclose(spread[1], torch.tensor(0.5)) and torch.allclose(spread[2:], torch.tensor(1.0))
     inverse, confidence = torch.full((4, 6), 0.5), torch.ones(4, 6)
     inverse[2], inverse[3, 3:] = 0.4, 0
     confidence[:, 1], confidence[:, 2] = 0.5, 0.1
-    told = Agreement(priors="weigh").within(maps, depth, DepthPrior(inverse, confidence, 0.5))
+    told = GeometricConsistency(priors="weigh").within(maps, depth, DepthPrior(inverse, confidence, 0.5))
     assert told[3, :3].tolist() == pytest.approx([2.0, 1.5, 1.1]) and told[3, 3:].tolist() == [1, 1, 1]
     assert told[2].tolist() == [0, 0, 1, 0, 0, 0], "a prior that is not confident contradicts nobody"
-    assert Agreement(priors="weigh").needs_prior and not TRUST.needs_prior
-    assert TSDF(trust=Agreement(priors="weigh")).needs_prior and not TSDF(trust=TRUST).needs_prior
+    assert GeometricConsistency(priors="weigh").needs_prior and not TRUST.needs_prior
+    assert TSDF(trust=GeometricConsistency(priors="weigh")).needs_prior and not TSDF(trust=TRUST).needs_prior
 
 
 def test_weights_are_multiplied_and_nothing_else():
@@ -237,7 +237,7 @@ def noisy(cameras):
 
 
 def test_tiles_threads_and_numpy_give_the_same_bits(monkeypatch, tmp_path):
-    mesher = TSDF(voxel=0.4, trust=Agreement(angle=25.0))
+    mesher = TSDF(voxel=0.4, trust=GeometricConsistency(angle=25.0))
     given = replace(noisy(around(24)), scratch=tmp_path)
     whole = mesher.mesh(given)
     assert np.abs(sphere(whole.vertices)).max() < 0.04 and not list(tmp_path.iterdir())
@@ -279,4 +279,4 @@ def test_settings_that_cannot_be_are_refused():
         {"neighbours": 0}, {"enough": 0.0}, {"enough": float("inf")}, {"covered_by": -1},
     ):  # fmt: skip
         with pytest.raises(BadInput, match=f"{next(iter(wrong))} .*(must be|give)"):
-            Agreement(**wrong)
+            GeometricConsistency(**wrong)

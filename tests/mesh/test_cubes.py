@@ -3,7 +3,7 @@
 import numpy as np
 from needs import needs
 
-from surfkit.mesh.cubes import EDGES, triangles
+from surfkit.mesh.cubes import CUBE_EDGES, triangles
 
 trimesh = needs("trimesh")
 
@@ -16,7 +16,7 @@ def case_triangles(case):
 def test_a_case_uses_exactly_the_edges_that_it_crosses():
     for case in range(256):
         crossed = set()
-        for edge, (x, y, z, axis) in enumerate(EDGES):
+        for edge, (x, y, z, axis) in enumerate(CUBE_EDGES):
             one = x + 2 * y + 4 * z
             if (case >> one & 1) != (case >> (one + (1 << axis)) & 1):
                 crossed.add(edge)
@@ -37,7 +37,7 @@ def test_random_fields_give_closed_manifolds_turned_outward():
         for triangle in case_triangles(case):
             face = []
             for edge in triangle:
-                dx, dy, dz, axis = EDGES[edge]
+                dx, dy, dz, axis = CUBE_EDGES[edge]
                 key = (x + dx, y + dy, z + dz, axis)
                 if key not in known:
                     known[key] = len(vertices)

@@ -3,7 +3,7 @@
 import numpy as np
 from needs import needs_native
 
-from surfkit.mesh.cut_tiles import UNKNOWN, Decided, tiles
+from surfkit.mesh.cut_tiles import UNDECIDED, DecidedTetrahedra, tiles
 from surfkit.mesh.delaunay import tetrahedralised
 from surfkit.raster.native import module
 
@@ -50,7 +50,7 @@ def test_tiles_have_the_tetrahedra_of_the_whole():
 
 def test_what_is_decided_is_taken_as_it_is():
     """Every tetrahedron that an earlier tile has decided is known to each later one, with its answer."""
-    decided, answers = Decided(), {}
+    decided, answers = DecidedTetrahedra(), {}
     shared = 0
     for tile in tiles(PLACES, 1_500, 0.3):
         tets = tetrahedralised(PLACES[tile.rows], tile.step)
@@ -59,9 +59,9 @@ def test_what_is_decided_is_taken_as_it_is():
         rows = np.sort(tile.rows[np.where(inside[:, None], tets.corners, 0)], axis=1)
         full = (rows.sum(1) // 7 % 2 == 0) & inside
         for row, known, is_inside in zip(map(tuple, rows.tolist()), given, inside, strict=True):
-            expected = answers.get(row, UNKNOWN) if is_inside else UNKNOWN
+            expected = answers.get(row, UNDECIDED) if is_inside else UNDECIDED
             assert known == expected
-            shared += known != UNKNOWN
+            shared += known != UNDECIDED
         decided.add(tile, tets.corners, full)
         answers |= {tuple(np.sort(row).tolist()): int(row.sum() // 7 % 2 == 0) for row in owned(tile, tets)}
     assert shared > 1_000

@@ -119,7 +119,7 @@ def test_open3d_reads_linear_colours(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
 def test_meshes_without_colour_and_large_ones(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr("surfkit.mesh.files.CHUNK", 100)
+    monkeypatch.setattr("surfkit.mesh.files.BATCH_ROWS", 100)
     mesh = ball()
     path = tmp_path / f"mesh.{kind}"
     write_mesh(path, Mesh(mesh.vertices, mesh.faces), Frame(np.zeros(3), 0.5))

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clusters
 from surfkit.mesh.floaters import drop_floaters
-from surfkit.mesh.lattice import Picture
+from surfkit.mesh.lattice import FusionImage
 from surfkit.mesh.tsdf import TSDF
 
 from .shapes import look_at, maps_of, seen, subject
@@ -32,7 +32,7 @@ def test_parts_in_the_open_go_and_parts_that_are_seen_stay():
     pictures = []
     for camera in CAMERAS:
         depth = seen(camera, wall_and_mast)[0].astype(np.float32)
-        pictures.append(Picture(depth, np.where(depth > 0, 32 << 24, 0).astype(np.uint32), camera))
+        pictures.append(FusionImage(depth, np.where(depth > 0, 32 << 24, 0).astype(np.uint32), camera))
     kept, dropped = drop_floaters(Mesh(vertices, faces), iter(pictures), 0.06, 1.0)
     assert dropped == 1 and set(np.unique(kept.faces // 4)) == {0, 2}
     blind = [replace(p, shade=p.shade & 0xFFFFFF) for p in pictures]
@@ -59,6 +59,6 @@ def test_a_mesh_without_what_one_view_alone_sees():
     assert judged.facts["floaters"] >= 1 and "floaters" not in plain.facts
     assert blob(plain) > 20 and blob(judged) == 0 and ball(plain) == ball(judged) > 5
     assert len(clusters(judged)[1]) < len(clusters(plain)[1])
-    trusted = replace(mesher, floaters=1.0, trust=Agreement(alone=1.0)).mesh(given)
+    trusted = replace(mesher, floaters=1.0, trust=GeometricConsistency(alone=1.0)).mesh(given)
     assert blob(trusted) == 0 and ball(trusted) > 5
     assert torch.equal(maps["1"].median, wrong)

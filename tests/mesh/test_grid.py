@@ -7,7 +7,7 @@ import pytest
 import torch
 from needs import needs, needs_native
 
-from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.mesh.native import NativeGrid
 from surfkit.mesh.reference import ReferenceGrid
 from surfkit.raster.native import module
@@ -24,7 +24,7 @@ def pictures(cameras, shape, seed=0):
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
         slant = draw.uniform(0.3, 1.3, depth.shape).astype(np.float32)
-        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
+        yield FusionImage(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 
 def fused(kind, views, carve=False, **lattice):
@@ -86,7 +86,7 @@ KINDS = [pytest.param(NativeGrid, marks=needs_native), ReferenceGrid]
 def plain(cameras, shape, color=0xC08040):
     for camera in cameras:
         depth = seen(camera, shape)[0].astype(np.float32)
-        yield Picture(depth, np.full(depth.shape, 32 << 24 | color, np.uint32), camera)
+        yield FusionImage(depth, np.full(depth.shape, 32 << 24 | color, np.uint32), camera)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -126,9 +126,9 @@ def test_carving_takes_away_what_later_views_see_through(kind):
     shade = np.full((72, 96), 32 << 24, np.uint32)
     for carve, gone in ((False, False), (True, True)):
         grid = kind(Lattice(VOXEL, 4 * VOXEL))
-        assert grid.fuse(Picture(floater, shade, camera), carve)
+        assert grid.fuse(FusionImage(floater, shade, camera), carve)
         for _ in range(6):
-            assert grid.fuse(Picture(depth, shade, camera), carve)
+            assert grid.fuse(FusionImage(depth, shade, camera), carve)
         heights = grid.surface(32).vertices[:, 2]
         assert (np.abs(heights) < 0.1).any() and (heights > 0.8).any() != gone
 

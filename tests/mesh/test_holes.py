@@ -9,7 +9,7 @@ from needs import needs
 from surfkit.mesh import holes
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clean
-from surfkit.mesh.holes import EVEN, close_holes, edges, fill
+from surfkit.mesh.holes import SIDE_AREA_WEIGHT, close_holes, edges, fill
 
 trimesh = needs("trimesh")
 
@@ -97,7 +97,7 @@ def test_rings_are_spanned_with_the_least_cost_of_all_ways(count):
     def cost(ring, faces):
         a, b, c = ring[np.array(faces)].transpose(1, 0, 2)
         sides = ((b - a) ** 2 + (c - b) ** 2 + (c - a) ** 2).sum()
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() + EVEN * sides
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() + SIDE_AREA_WEIGHT * sides
 
     rings = np.random.default_rng(count).normal(size=(20, count, 3))
     for ring, faces in zip(rings, fill(rings), strict=True):
@@ -108,7 +108,7 @@ def test_rings_are_spanned_with_the_least_cost_of_all_ways(count):
 def test_many_rings_are_filled_in_parts(monkeypatch):
     holed = ball(without=(100, 300, 500))
     whole = close_holes(holed, 6)
-    monkeypatch.setattr(holes, "AT_ONCE", 1)
+    monkeypatch.setattr(holes, "BATCH_CORNER_PAIRS", 1)
     closed, count = close_holes(holed, 6)
     assert count == whole[1] == 3 and np.array_equal(closed.faces, whole[0].faces)
 

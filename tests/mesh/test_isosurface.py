@@ -24,7 +24,7 @@ def volume(vertices, faces):
 @pytest.mark.parametrize("tile", [7, 48])
 @pytest.mark.parametrize("steepest", [None, 1.0])
 def test_a_sphere_is_closed_and_of_the_right_size_whatever_the_tiles(tile, steepest, monkeypatch):
-    monkeypatch.setattr(module, "TILE", tile)
+    monkeypatch.setattr(module, "TILE_CELLS", tile)
     vertices, faces = isosurface(sphere, LOW, HIGH, 0.05, steepest)
     assert vertices.dtype == np.float32 and faces.dtype == np.int32
     assert np.abs(sphere(vertices)).max() < 0.05**2, "of the second order in the side of a cell"
@@ -75,8 +75,8 @@ def test_what_cannot_be_meshed_is_refused(function, voxel, text):
 
 
 def test_a_surface_between_the_points_of_the_first_look_is_found():
-    voxel = 2 / module.TILE
-    middle = -1 + voxel * (module.COARSE * np.array([2, 1, 3]) + 0.5 * module.COARSE)
+    voxel = 2 / module.TILE_CELLS
+    middle = -1 + voxel * (module.COARSE_STEP_CELLS * np.array([2, 1, 3]) + 0.5 * module.COARSE_STEP_CELLS)
 
     def small(points):
         return np.linalg.norm(points - middle, axis=1) - 1.5 * voxel

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import fusion, tsdf
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.cuda import grid as gpu_grid
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
@@ -51,11 +51,11 @@ def test_same_surface_with_few_waits(carve):
 
 
 def test_trust_and_floaters():
-    both(TSDF(voxel=0.5, least_views=0.25, trust=Agreement(neighbours=3), floaters=1.0))
+    both(TSDF(voxel=0.5, least_views=0.25, trust=GeometricConsistency(neighbours=3), floaters=1.0))
 
 
 def test_tiles(monkeypatch):
-    monkeypatch.setattr(tsdf, "SHARE", 100 * tsdf.GRID_BYTES / 2**30)
+    monkeypatch.setattr(tsdf, "GRID_BUDGET_SHARE", 100 * tsdf.GRID_BYTES / 2**30)
     mesh, waits = both(TSDF(voxel=0.3))
     assert mesh.facts["tiles"] > 2 and waits["to cpu"] == 4 * mesh.facts["tiles"]
 
@@ -76,7 +76,7 @@ def test_tiles_are_as_small_as_the_gpu_is(monkeypatch):
 def test_memory_that_runs_out_leads_to_smaller_tiles(monkeypatch):
     """Another program takes the memory in the meantime."""
     whole, zeros = TSDF(voxel=0.3).mesh(subject(around(VIEWS), torus)), torch.zeros
-    monkeypatch.setattr(gpu_grid, "CHUNK", 50)
+    monkeypatch.setattr(gpu_grid, "CHUNK_BLOCKS", 50)
     held, plain = [], gpu_grid.GpuGrid._has_room
 
     def limited(grid, blocks):

@@ -9,7 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import oversampling
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.oversampling import magnified, oversampled
 from surfkit.mesh.tsdf import TSDF
 
@@ -74,7 +74,7 @@ def test_masks_and_priors_have_the_size_of_what_is_drawn():
     assert torch.allclose(more.priors[1].inverse[:, 1:-1], between[:, 1:-1])
     assert torch.equal(more.priors[1].normal[2], twice)
     assert torch.equal(more.priors[2].confidence, twice / 2000)
-    made = TSDF(**LENGTHS, oversampling=1.5, trust=Agreement(priors="weigh", alone=1.0)).mesh(given)
+    made = TSDF(**LENGTHS, oversampling=1.5, trust=GeometricConsistency(priors="weigh", alone=1.0)).mesh(given)
     assert len(made.faces)
     assert oversampled(given, 1) is given
 

@@ -88,7 +88,7 @@ def test_large_meshes_are_judged_by_some_of_their_triangles(monkeypatch):
     )
     slope, upright = Mesh(vertices, faces), np.array([-0.5, 0, 1]) / 1.25**0.5
     whole = up_of(slope, ()), from_above(slope, upright, 80)
-    monkeypatch.setattr(shade, "SAMPLES", 350)
+    monkeypatch.setattr(shade, "SAMPLED_ELEMENTS", 350)
     some = up_of(slope, ()), from_above(slope, upright, 80)
     for up, picture in (whole, some):
         np.testing.assert_allclose(up, upright, atol=1e-6)

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import sky as module
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.sky import may_show_sky, sky, without_sky
 from surfkit.mesh.tsdf import TSDF
 
@@ -60,7 +60,7 @@ def test_views_that_look_down_show_no_sky_and_need_no_depth_maps():
         given = subject(cameras, house)
         assert may_show_sky(given.views, UP) == shown
         assert TSDF(sky=False).needs_prior_of(given.views, given.frame) == shown
-        assert TSDF(sky=False, trust=Agreement(priors="weigh")).needs_prior_of(given.views, given.frame)
+        assert TSDF(sky=False, trust=GeometricConsistency(priors="weigh")).needs_prior_of(given.views, given.frame)
         assert not TSDF().needs_prior_of(given.views, given.frame)
     with mock.patch.object(module, "emit") as told:
         given = subject(down, house)

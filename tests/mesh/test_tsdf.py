@@ -14,11 +14,11 @@ from surfkit.core.events import Progress
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.mesh import fusion, native, tsdf
-from surfkit.mesh.lattice import SIDE, Lattice, least_slant
-from surfkit.mesh.lengths import LEAST_CUT, without_hidden
+from surfkit.mesh.lattice import BLOCK_SIDE_VOXELS, Lattice, least_slant
+from surfkit.mesh.lengths import MIN_TRUNCATION_VOXELS, without_hidden
 from surfkit.mesh.picture import depth_of, picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
-from surfkit.mesh.tiles import Box, different
+from surfkit.mesh.tiles import BlockRange, different
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.scene.camera import Camera
@@ -167,9 +167,9 @@ def test_tiles_join_to_what_one_grid_gives(monkeypatch, tmp_path, carve):
 
 
 def cut_in_eight():
-    boxes = [Box()]
+    boxes = [BlockRange()]
     for _ in range(3):
-        boxes = [half for box in boxes for half in box.halves(Box((-3, -2, -1), (2, 3, 2)))]
+        boxes = [half for box in boxes for half in box.halves(BlockRange((-3, -2, -1), (2, 3, 2)))]
     return boxes
 
 
@@ -183,8 +183,8 @@ def test_a_grid_that_outgrows_its_memory_is_cut_until_it_fits(monkeypatch):
         return made[-1]
 
     monkeypatch.setattr(fusion, "grid", counted)
-    monkeypatch.setattr(tsdf, "SHARE", 64 * tsdf.GRID_BYTES / given.budget_bytes)
-    monkeypatch.setattr(tsdf, "estimate", lambda *_: tsdf.Estimate(np.zeros((1, 3), int), 1, 1))
+    monkeypatch.setattr(tsdf, "GRID_BUDGET_SHARE", 64 * tsdf.GRID_BYTES / given.budget_bytes)
+    monkeypatch.setattr(tsdf, "estimate", lambda *_: tsdf.GridEstimate(np.zeros((1, 3), int), 1, 1))
     tiled = TSDF(voxel=0.3).mesh(given)
     assert tiled.facts["tiles"] >= 4 and max(grid.blocks for grid in made) <= 64
     assert np.array_equal(faces_by_place(whole), faces_by_place(tiled))
@@ -289,18 +289,18 @@ def test_a_tile_gets_all_views_that_reach_into_it():
     """A pixel seen from the side reaches further behind its surface, along the ray, than the truncation."""
     lattice = Lattice(0.01, 0.4)
     camera = look_at((0, 0, 2.0), (0, 0.0001, 0.0))
-    task = fusion.Task(lattice, (camera,), lambda at: None, 1.0, True, 1, None)
+    task = fusion.FusionTask(lattice, (camera,), lambda at: None, 1.0, True, 1, None)
     lowest = 2.0 - 1.0 - lattice.truncation / lattice.least_slant
-    assert fusion.in_sight(camera, task).low[2] * SIDE * lattice.voxel <= lowest
+    assert fusion.in_sight(camera, task).low[2] * BLOCK_SIDE_VOXELS * lattice.voxel <= lowest
 
 
 def test_a_surface_seen_from_the_side_has_no_holes():
     """With the least truncation, the shell behind the ground is thinner along the rays than a cell is wide."""
     camera = look_at((1.6, 0.1, 1.0), (0.0, 0.1001, 0.0))
     maps = maps_of(camera, lambda points: points[..., 2])
-    found, places = picture(maps.median, maps, camera, 0.03, LEAST_CUT * 0.03), []
+    found, places = picture(maps.median, maps, camera, 0.03, MIN_TRUNCATION_VOXELS * 0.03), []
     for some in (found, replace(found, slant=None)):
-        grid = ReferenceGrid(Lattice(0.03, LEAST_CUT * 0.03))
+        grid = ReferenceGrid(Lattice(0.03, MIN_TRUNCATION_VOXELS * 0.03))
         assert grid.fuse(some, True)
         piece = grid.surface(1)
         middles = piece.vertices[piece.faces].mean(1)
@@ -319,7 +319,7 @@ def test_a_road_seen_by_someone_who_walks_on_it_is_whole():
     pose[:3, :3], pose[:3, 3] = turn, -turn @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
     camera = Camera(pose, 250.0, 250.0, 75.0, -25.0, 150, 190)  # the lower middle of a photograph
     maps = maps_of(camera, lambda points: points[..., 2])
-    voxel, cut = 0.04, LEAST_CUT * 0.04
+    voxel, cut = 0.04, MIN_TRUNCATION_VOXELS * 0.04
     road = ReferenceGrid(Lattice(voxel, cut))
     assert road.fuse(picture(torch.where(maps.median < 20, maps.median, 0), maps, camera, voxel, cut), True)
     piece = road.surface(1)
@@ -336,7 +336,7 @@ def test_no_pixel_reaches_further_than_the_compiled_grid_looks():
     """It leaves out blocks by the least slant that there can be, a constant in mesh/cpu/fuse.h."""
     header = (Path(native.__file__).parent / "cpu" / "fuse.h").read_text()
     (bound,) = re.findall(r"kLeastSlant = ([0-9.]+)f;", header)
-    assert 0.98 * least_slant(1.0, LEAST_CUT) < float(bound) <= least_slant(1.0, LEAST_CUT)
+    assert 0.98 * least_slant(1.0, MIN_TRUNCATION_VOXELS) < float(bound) <= least_slant(1.0, MIN_TRUNCATION_VOXELS)
 
 
 @needs_native

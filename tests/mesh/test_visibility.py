@@ -12,13 +12,13 @@ from surfkit.core.events import Progress, Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.mesh.adjust import adjusted, face_normals
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
 from surfkit.mesh.manifold import separated
 from surfkit.mesh.points import boxes_with, gather, merged
-from surfkit.mesh.sights import Seeing, Sight
+from surfkit.mesh.sights import ObservationSettings, ViewObservation
 from surfkit.mesh.sights import seen as seen_by_all
 from surfkit.mesh.visibility import OUTWARD, Visibility
 from surfkit.raster.native import module
@@ -192,13 +192,15 @@ def test_tiles_meet(ring, monkeypatch):
 
 def test_tiles_that_know_nothing_of_each_other_do_not_meet(monkeypatch):
     """What the test before measures: without what is decided, it is another surface in each tile."""
-    monkeypatch.setattr("surfkit.mesh.cut_tiles.Decided.of", lambda self, tile, corners: np.full(len(corners), -1))
+    monkeypatch.setattr(
+        "surfkit.mesh.cut_tiles.DecidedTetrahedra.of", lambda self, tile, corners: np.full(len(corners), -1)
+    )
     mesh, _ = meshed_with(subject(CAMERAS, torus, budget_bytes=8_000_000), monkeypatch, halo=10.0)
     assert boundary_share(mesh)[0] > 0.0005
 
 
 def test_points_are_the_same_however_many_boxes_they_are_gathered_in():
-    how = Seeing("median", 10.0, Agreement(), 0.05, 0.0, 0.25)
+    how = ObservationSettings("median", 10.0, GeometricConsistency(), 0.05, 0.0, 0.25)
     with seen_by_all(subject(CAMERAS, torus), how) as sights:
         assert len(boxes_with(sights, 0.03, 10.0, 2_000)) >= 4
         whole, parts = (gather(sights, 0.03, 10.0, 0.1, 0.05, most) for most in (10**9, 2_000))
@@ -240,8 +242,10 @@ def test_what_a_view_itself_trusts_less_weighs_less():
         return replace(maps, depth=1.01 * maps.depth)
 
     weights = []
-    for trust in (Agreement(), Agreement(spread=0.01)):
-        with seen_by_all(replace(given, draw=spread), Seeing("median", 10.0, trust, 0.05, 0.0, 0.25)) as sights:
+    for trust in (GeometricConsistency(), GeometricConsistency(spread=0.01)):
+        with seen_by_all(
+            replace(given, draw=spread), ObservationSettings("median", 10.0, trust, 0.05, 0.0, 0.25)
+        ) as sights:
             weights.append(sights[0].weight[0])
     there = weights[0] > 0
     assert there.sum() > 100 and np.allclose(weights[1][there] / weights[0][there], 0.5, atol=0.01)
@@ -259,7 +263,9 @@ def sight(depth, weight, normal=(0.0, 0.0, -1.0)):
     shape = (1, 12, 16)
     normals = np.broadcast_to(np.array(normal, np.float32)[:, None, None], (3, 12, 16)).copy()
     color = np.zeros((3, 12, 16), np.uint8)
-    return Sight(camera, np.full(shape, depth, np.float32), np.full(shape, weight, np.float32), normals, color)
+    return ViewObservation(
+        camera, np.full(shape, depth, np.float32), np.full(shape, weight, np.float32), normals, color
+    )
 
 
 def test_votes_by_the_distance_from_the_plane_of_a_pixel():
@@ -381,7 +387,7 @@ class Exact:
             depth = maps.depth[None].numpy()
             color = np.zeros((3, *depth.shape[1:]), np.uint8)
             weight = (depth > 0).astype(np.float32)
-            self.found.append(Sight(view.camera, depth, weight, maps.normal.numpy(), color))
+            self.found.append(ViewObservation(view.camera, depth, weight, maps.normal.numpy(), color))
 
     def __len__(self):
         return len(self.found)

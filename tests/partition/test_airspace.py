@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from surfkit.partition import Airspace, CameraGrid, PictureShare
 from surfkit.partition.airspace import filled
 from surfkit.partition.base import Ground
-from surfkit.partition.plan import Fewest, plan
+from surfkit.partition.plan import BlockMinimums, plan
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
@@ -133,7 +133,7 @@ def test_a_view_through_the_air_joins_though_it_shows_no_point():
     pose[:3, 3] = -pose[:3, :3] @ torch.tensor([0.5, -0.3, 0.25], dtype=torch.float64)
     level = View("level.png", Camera(pose, 50.0, 50.0, 24.0, 39.0, 48, 40), path=None)  # above the horizon
     sight = replace(sight, splats=replace(sight.splats, means=means), views=(*sight.views, level))
-    way, fewest = CameraGrid((2, 1)), Fewest(1, 0, 0)
+    way, fewest = CameraGrid((2, 1)), BlockMinimums(1, 0, 0)
     by_air, by_share = (plan(sight, way, assign, fewest).blocks for assign in (Airspace(), PictureShare(0.25)))
     assert "level.png" in by_air[0].views and "level.png" not in by_share[0].views
     assert {view.name for view in sight.views} == {name for block in by_air for name in block.views}

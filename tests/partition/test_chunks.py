@@ -8,12 +8,12 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
-from surfkit.partition import ContractedGrid, QuantileGrid, SparsePoints, SquareGrid
-from surfkit.partition.plan import Fewest, plan, thinned
+from surfkit.partition import ContractedGrid, QuantileGrid, SparsePointShare, SquareGrid
+from surfkit.partition.plan import BlockMinimums, plan, thinned
 from surfkit.runs.blocks.schedule import Compute
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.scene import Frame, View
 from surfkit.testing.inputs import above, coarse_model
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -65,12 +65,12 @@ def test_lengths_that_do_not_fit():
         lambda: SquareGrid(side=0.0),
         lambda: SquareGrid(across=0),
         lambda: SquareGrid(padding=-0.1),
-        lambda: SparsePoints(points=-1),
-        lambda: SparsePoints(growth=0.5),
-        lambda: SparsePoints(chance=1.1),
-        lambda: SparsePoints(few=-1),
-        lambda: SparsePoints(share=-1.0),
-        lambda: SparsePoints(most=0),
+        lambda: SparsePointShare(points=-1),
+        lambda: SparsePointShare(growth=0.5),
+        lambda: SparsePointShare(chance=1.1),
+        lambda: SparsePointShare(few=-1),
+        lambda: SparsePointShare(share=-1.0),
+        lambda: SparsePointShare(most=0),
     ):
         with pytest.raises(BadInput):
             make()
@@ -86,7 +86,9 @@ def random_scene(views: int, seed: int = 0, **more):
         middle, wide = cameras[i] + draws.normal(size=2) * 0.3, draws.choice([0.05, 0.2, 0.4])
         rows = np.flatnonzero((np.abs(xyz[:, :2] - middle) < wide).all(1))
         rows = draws.permutation(rows)
-        seen[f"{i:04}.png"] = Seen(np.concatenate([rows, rows[:3]]), np.zeros((len(rows) + min(3, len(rows)), 2)))
+        seen[f"{i:04}.png"] = Observations2D(
+            np.concatenate([rows, rows[:3]]), np.zeros((len(rows) + min(3, len(rows)), 2))
+        )
     observations = Observations(xyz, np.zeros(len(xyz)), seen)
     return under(cameras.tolist(), observations=observations, **more)
 
@@ -118,7 +120,7 @@ def probabilities(sight, cells, rule):
 @pytest.mark.parametrize("few", [10, 60])
 def test_views_join_by_the_rule(few):
     """What is sure joins, what is excluded does not, and what is left to chance joins as often as it should."""
-    sight, rule = random_scene(120), SparsePoints(few=few)
+    sight, rule = random_scene(120), SparsePointShare(few=few)
     cells = SquareGrid(across=4, padding=0.0).cells(sight)
     chances, times = probabilities(sight, cells, rule), 400
     joined = sum(rule.joins(replace(sight, seed=seed), cells).numpy().astype(float) for seed in range(times))
@@ -133,13 +135,13 @@ def test_views_join_by_the_rule(few):
 def test_the_same_seed_draws_the_same_views():
     sight = random_scene(60)
     cells = SquareGrid(across=3).cells(sight)
-    first, again, other = (SparsePoints().joins(replace(sight, seed=seed), cells) for seed in (7, 7, 8))
+    first, again, other = (SparsePointShare().joins(replace(sight, seed=seed), cells) for seed in (7, 7, 8))
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
 def test_other_cells_too():
     """Cells in contracted space, and a block of several cells: with a camera inside, the points decide."""
-    sight, rule = random_scene(60), SparsePoints(points=20, few=20)
+    sight, rule = random_scene(60), SparsePointShare(points=20, few=20)
     for cells in (ContractedGrid((2, 2)).cells(sight), QuantileGrid((3, 1)).cells(sight)):
         joins = rule.joins(sight, cells)
         for v, view in enumerate(sight.views):
@@ -166,17 +168,19 @@ def test_of_too_many_views_some_are_left_out_by_chance():
 
 def test_a_plan_keeps_to_the_limit_and_the_seed():
     sight = random_scene(200)
-    made = plan(sight, SquareGrid(), SparsePoints(most=30), Fewest(views=20))
+    made = plan(sight, SquareGrid(), SparsePointShare(most=30), BlockMinimums(views=20))
     assert all(20 <= len(block.views) <= 30 and block.cameras <= len(block.views) for block in made.blocks)
     assert sum(block.points for block in made.blocks) == len(sight.splats)
-    again, other = (plan(replace(sight, seed=s), SquareGrid(), SparsePoints(most=30), Fewest(20)) for s in (0, 1))
+    again, other = (
+        plan(replace(sight, seed=s), SquareGrid(), SparsePointShare(most=30), BlockMinimums(20)) for s in (0, 1)
+    )
     assert again == made and other != made
 
 
 def test_a_data_set_without_observations_is_refused_before_it_is_trained(tmp_path):
     truth = photograph(Flight(views=8, width=32, height=24, points=200))
     stage = Stage(steps=4)
-    recipe = Recipe(pretrain=stage, partition=SquareGrid(), assign=SparsePoints(points=5, few=1), tune=stage)
+    recipe = Recipe(pretrain=stage, partition=SquareGrid(), assign=SparsePointShare(points=5, few=1), tune=stage)
     write_colmap(tmp_path / "without", truth)
     with pytest.raises(BadInput, match="without: assign sparse-points needs the sparse points.*has none"):
         run(recipe, Data(tmp_path / "without"), tmp_path / "run", Compute("cpu"))

@@ -9,7 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.losses.base import RegularizerInput
 from surfkit.losses.consensus import Consensus, column
-from surfkit.partition.consensus import Agreement, Copies, agree, columns_after, common, mean_copies
+from surfkit.partition.consensus import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
 from surfkit.testing.inputs import splats
 
 IDS = [[0, 1, 2, 3, 5], [1, 2, 4, 5], [2, 3, 5, 6]]
@@ -47,7 +47,7 @@ def rounds(terms, rule, count):
             left = a + rho[:, None, None] * np.eye(3)
             right = (a @ c[:, :, None])[:, :, 0] + rho[:, None] * pull.numpy()
             x = np.linalg.solve(left, right[:, :, None])[:, :, 0]
-            copies.append(Copies(torch.tensor(ids), {"means": torch.from_numpy(x)}))
+            copies.append(PointCopies(torch.tensor(ids), {"means": torch.from_numpy(x)}))
         if number < count:
             before = agree(copies, rule, before, (number + 1) * rule.every)
             stats = [columns_after(c, known, before, rule) for c, known in zip(copies, stats, strict=True)]
@@ -73,7 +73,7 @@ def test_without_agreement_they_would_not():
 
 
 def test_what_is_common_and_its_mean():
-    blocks = [Copies(torch.tensor(ids), {"v": torch.rand(len(ids), 2, 3)}) for ids in IDS]
+    blocks = [PointCopies(torch.tensor(ids), {"v": torch.rand(len(ids), 2, 3)}) for ids in IDS]
     ids = common([block.ids for block in blocks])
     assert ids.tolist() == [1, 2, 3, 5]
     means, counts = mean_copies(blocks, torch.arange(8))
@@ -85,7 +85,10 @@ def test_what_is_common_and_its_mean():
 
 
 def test_blocks_without_common_points():
-    blocks = [Copies(torch.tensor([0, 1]), {"v": torch.rand(2)}), Copies(torch.tensor([2]), {"v": torch.rand(1)})]
+    blocks = [
+        PointCopies(torch.tensor([0, 1]), {"v": torch.rand(2)}),
+        PointCopies(torch.tensor([2]), {"v": torch.rand(1)}),
+    ]
     found = agree(blocks, Consensus(), None, 200)
     assert not len(found.ids) and not columns_after(blocks[0], {}, found, Consensus())[column("rho", "v")].any()
 
@@ -93,15 +96,15 @@ def test_blocks_without_common_points():
 def test_rho_follows_the_residuals_of_each_parameter():
     """Differences of 3 and 1 among copies; means that have moved by hardly anything, and by far."""
     ids = torch.tensor([4, 9])
-    blocks = [Copies(ids, {"a": torch.tensor([s, s]), "b": torch.tensor([[s], [s]])}) for s in (1.0, -1.0)]
+    blocks = [PointCopies(ids, {"a": torch.tensor([s, s]), "b": torch.tensor([[s], [s]])}) for s in (1.0, -1.0)]
     z = {"a": torch.zeros(2), "b": torch.full((2, 1), 100.0)}
-    before = Agreement(ids, z, {"a": 2.0, "b": 2.0})
+    before = ConsensusState(ids, z, {"a": 2.0, "b": 2.0})
     assert agree(blocks, Consensus(balance_until=50), before, 50).rho == {"a": 4.0, "b": 1.0}
     assert agree(blocks, Consensus(balance_until=50), before, 51).rho == {"a": 2.0, "b": 2.0}
-    near = Agreement(ids, {"a": torch.full((2,), 0.5), "b": torch.full((2, 1), 0.5)}, before.rho)
+    near = ConsensusState(ids, {"a": torch.full((2,), 0.5), "b": torch.full((2, 1), 0.5)}, before.rho)
     assert agree(blocks, Consensus(), near, 50).rho == {"a": 2.0, "b": 2.0}, "2 and 1 are alike"
     known = {column("rho", "a"): torch.tensor([1.0, 1.0]), column("u", "a"): torch.tensor([0.5, 0.0])}
-    after = columns_after(blocks[0], known, Agreement(ids, z, {"a": 4.0, "b": 1.0}), Consensus(relaxation=1.5))
+    after = columns_after(blocks[0], known, ConsensusState(ids, z, {"a": 4.0, "b": 1.0}), Consensus(relaxation=1.5))
     assert after[column("rho", "a")].tolist() == [2.0, 2.0] and after[column("u", "a")].tolist() == [1.0, 0.75]
 
 

@@ -22,7 +22,7 @@ from surfkit.partition import (
 )
 from surfkit.partition.base import Contraction, Ground
 from surfkit.partition.merge import Merge
-from surfkit.partition.plan import Fewest, Plan, plan, touching, with_enough
+from surfkit.partition.plan import BlockMinimums, PartitionPlan, plan, touching, with_enough
 from surfkit.testing import check_partition
 from surfkit.testing.inputs import above, coarse_model
 
@@ -146,7 +146,7 @@ def test_balanced_cells_share_the_work():
     sight = coarse_model()
 
     def unevenness(way):
-        shares = [block.work for block in plan(sight, way, PictureShare(0.02), Fewest(views=1)).blocks]
+        shares = [block.work for block in plan(sight, way, PictureShare(0.02), BlockMinimums(views=1)).blocks]
         return max(shares) * len(shares)
 
     assert unevenness(Balanced(6, threshold=0.02)) < 1.35 < unevenness(ContractedGrid((3, 2)))
@@ -189,7 +189,7 @@ def test_the_plan_names_everything_and_survives_a_file():
     assert sum(block.work for block in made.blocks) == pytest.approx(1)
     assert {name for block in made.blocks for name in block.views} == {view.name for view in sight.views}
     assert all(len(block.views) >= 2 for block in made.blocks)
-    assert load(Plan, dump(made), "plan") == made
+    assert load(PartitionPlan, dump(made), "plan") == made
 
 
 def test_blocks_with_few_views_join_the_neighbour_that_shares_them():
@@ -235,7 +235,7 @@ def test_corners_do_not_touch():
 
 
 def test_small_scenes_need_fewer_views():
-    assert Fewest().of(5_000, 16) == 50 and Fewest().of(30, 4) == 2 and Fewest().of(3, 8) == 1
+    assert BlockMinimums().of(5_000, 16) == 50 and BlockMinimums().of(30, 4) == 2 and BlockMinimums().of(3, 8) == 1
 
 
 def merged(cells, coarse, tuned, skipped=frozenset()):

@@ -9,9 +9,9 @@ from surfkit.core.registry import components
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.base import Primitive, rotated
 from surfkit.primitives.edit import Edit, apply
-from surfkit.primitives.init import ALONE, SMALLEST, gaps
+from surfkit.primitives.init import LONE_POINT_SIZE, MIN_POINT_SIZE, gaps
 from surfkit.primitives.points import Points
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 ALL = [Surfel2D(), Gaussian3D(), Flat3D()]
 names = dict(ids=lambda part: type(part).__name__)
@@ -21,11 +21,11 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def cloud(count: int = 50, normals: bool = False) -> Cloud:
+def cloud(count: int = 50, normals: bool = False) -> SparsePoints:
     draw = generator(1)
     unit = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1) if normals else None
     xyz = torch.randn(count, 3, generator=draw)
-    return Cloud(xyz, torch.randint(0, 256, (count, 3), generator=draw, dtype=torch.uint8), unit)
+    return SparsePoints(xyz, torch.randint(0, 256, (count, 3), generator=draw, dtype=torch.uint8), unit)
 
 
 def matrix(quat: np.ndarray) -> np.ndarray:
@@ -122,11 +122,11 @@ def test_gaps_are_root_mean_square_distances_to_three_neighbours():
 @pytest.mark.parametrize(
     ("xyz", "wanted"),
     [
-        ([[1, 2, 3]], [ALONE]),
+        ([[1, 2, 3]], [LONE_POINT_SIZE]),
         ([[0, 0, 0], [0, 0, 2]], [2, 2]),
-        ([[1, 1, 1]] * 5, [ALONE] * 5),
+        ([[1, 1, 1]] * 5, [LONE_POINT_SIZE] * 5),
         ([[0, 0, 0]] * 4 + [[3, 4, 0]], [5] * 5),
-        ([[0, 0, 0], [0, 0, 1e-9]], [SMALLEST] * 2),
+        ([[0, 0, 0], [0, 0, 1e-9]], [MIN_POINT_SIZE] * 2),
     ],
 )
 def test_gaps_of_degenerate_clouds(xyz, wanted):

@@ -32,7 +32,7 @@ from surfkit.raster.select import select
 from surfkit.runs.pipeline import load_run
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import photo_cache
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing import check_primitive
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -324,7 +324,9 @@ def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
     drawn = run.last.primitive.activate(state.points.params, 0).opacities
     table = read_splats(tmp_path / "run" / "point_cloud.ply")
     assert torch.allclose(table.opacity_logits.sigmoid(), drawn, atol=1e-6)
-    points = Points.fresh(Fog().init(Cloud(torch.rand(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator()))
+    points = Points.fresh(
+        Fog().init(SparsePoints(torch.rand(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator())
+    )
     points.params["opacities"].zero_()  # drawn as 0.632
     lowered = apply(Fog(), points, Edit(max_opacity=0.3), torch.Generator())
     assert Fog().activate(lowered.params, 0).opacities.tolist() == pytest.approx([0.3, 0.3])
@@ -366,7 +368,9 @@ def test_absolute_gradients_that_torch_does_not_have_are_refused(source, tmp_pat
 
 def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
     splats = Pairs().activate(
-        Pairs().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
+        Pairs().init(
+            SparsePoints(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)
+        ),
         0,
     )
     camera = Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 8.0, 8.0, 16, 16)
@@ -377,7 +381,9 @@ def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
 
 def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     """`AutogradRender` around the reference's own drawing, against the reference's way back."""
-    params = Balls().init(Cloud(torch.rand(12, 3) - 0.5, torch.full((12, 3), 90, dtype=torch.uint8)), torch.Generator())
+    params = Balls().init(
+        SparsePoints(torch.rand(12, 3) - 0.5, torch.full((12, 3), 90, dtype=torch.uint8)), torch.Generator()
+    )
     params["scales"] -= 1
     splats = Balls().activate(params, 0).detached()
     pose = torch.eye(4, dtype=torch.float64)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import KINDS, Splats
+from surfkit.raster.api import PRIMITIVE_KINDS, Splats
 from surfkit.scene.camera import Camera
 
 NEAR = 0.05
@@ -190,7 +190,7 @@ SCENES: dict[str, Callable[[str, int, int], tuple[Splats, Camera]]] = {
 FOR_GAUSSIANS = ("antialias", "undilated")
 CASES = [
     (name, kind)
-    for kind in (*KINDS, "plane", "ray")
+    for kind in (*PRIMITIVE_KINDS, "plane", "ray")
     for name in SCENES
     if name not in FOR_GAUSSIANS or kind in ("gaussian", "plane")
 ]
@@ -200,7 +200,7 @@ CASES = [
 def make(name: str, kind: str, degree: int | None = None, seed: int = 3) -> tuple[Splats, Camera]:
     """A scene by name, of a kind or of gaussians with a geometry; without a degree, one that differs by scene."""
     degree = list(SCENES).index(name) % 4 if degree is None else degree
-    if kind in KINDS:
+    if kind in PRIMITIVE_KINDS:
         return SCENES[name](kind, degree, seed)
     made, view = SCENES[name]("gaussian", degree, seed)
     if (name, kind) == ("tiny", "ray"):  # nothing widens them: no pixel would see smaller ones

@@ -17,7 +17,7 @@ from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera
 
 from .cases import FORWARD, Case, added, case, different_gradients, different_maps, true_gradients
-from .scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
+from .scenes import CASES, NEAR, PRIMITIVE_KINDS, SCENES, Draw, camera, double, make, rows
 
 pytestmark = needs_native
 each_case = pytest.mark.parametrize(("name", "kind"), CASES)
@@ -36,7 +36,7 @@ def test_maps_equal_the_reference(name, kind):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_every_degree_of_the_colour(kind, degree):
     c = case("plain", kind, degree)
     assert c.splats.sh.shape[1] == (degree + 1) ** 2
@@ -118,7 +118,7 @@ def test_contribution_equals_the_reference(name, kind):
         assert ((total - true_total).abs() <= 1e-4 * (1 + true_total) + near).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_contribution_is_exact_away_from_thresholds(kind):
     shown, view = make("plain", kind)
     for i in range(40):
@@ -150,7 +150,7 @@ def test_opacity_before_points_equals_the_reference(name, kind):
     assert risky.double().mean() < 0.01 and error.median() < 1e-6
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_opacity_before_a_point_behind_everything_is_that_of_the_image(kind):
     shown, view = make("plain", kind)
     rays = view.rays(torch.float64).flatten(1).T * 50
@@ -162,7 +162,7 @@ def test_opacity_before_a_point_behind_everything_is_that_of_the_image(kind):
     assert not NativeRasterizer().opacity_before(shown, view, NEAR, points).any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_backward_is_linear(kind):
     c = case("opaque", kind)
     render = rendered(c)
@@ -173,7 +173,7 @@ def test_backward_is_linear(kind):
     assert not different_gradients(both, added([one, two]))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_fewer_maps_are_the_same_maps(kind):
     c = case("faint", kind)
     whole = rendered(c)
@@ -225,7 +225,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("kind", (*KINDS, "ray"))
+@pytest.mark.parametrize("kind", (*PRIMITIVE_KINDS, "ray"))
 def test_the_number_of_threads_does_not_change_a_bit(kind, threads):
     shown, view = crowd(kind)
     made = {}
@@ -263,7 +263,7 @@ def test_every_compilation_of_the_kernels_equals_the_reference(name, kind, compi
     assert not different_gradients(render.backward(Maps(**c.cotangents)), true)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_compilations_agree_on_a_larger_view(kind, kernels):
     """The scenes above compare each with the reference; this one adds tiles cut by the border and long lists."""
     shown, view = crowd(kind)
@@ -281,7 +281,7 @@ def test_compilations_agree_on_a_larger_view(kind, kernels):
             assert apart.double().mean() < 3e-3, key  # a few pixels sit on a threshold
 
 
-@pytest.mark.parametrize("kind", (*KINDS, "ray"))
+@pytest.mark.parametrize("kind", (*PRIMITIVE_KINDS, "ray"))
 def test_culling_never_loses_a_pixel(kind):
     """One splat at a time, of every scene, against the alpha of the reference at every pixel."""
     for name in [name for name, k in CASES if k == kind]:
@@ -298,7 +298,7 @@ def test_culling_never_loses_a_pixel(kind):
             assert not lost.any(), f"{name}: splat {i} at {lost.nonzero()[:3, 0].tolist()}"
 
 
-@pytest.mark.parametrize("kind", (*KINDS, "ray"))
+@pytest.mark.parametrize("kind", (*PRIMITIVE_KINDS, "ray"))
 def test_what_only_grazes_the_image_is_seen(kind):
     """Splats of every size around the rim: those that reach a pixel are drawn, most of the others are left out."""
     draws, count = Draw(5), 1_500
@@ -322,7 +322,7 @@ def test_what_only_grazes_the_image_is_seen(kind):
     assert 100 < reaches.sum() <= seen.sum() < 2 * reaches.sum()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [("scales", float("nan"), "not finite"), ("means", float("inf"), "not finite"), ("scales", -1.0, "not positive"),
@@ -346,7 +346,7 @@ def test_values_beyond_float32_are_refused():
         NativeRasterizer().render(exact, view, NEAR)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_no_splats_and_splats_behind_the_camera_give_black(kind):
     shown, view = make("plain", kind)
     behind = shown.means - 5 * view.world_to_camera[2, :3].float()
@@ -360,7 +360,7 @@ def test_no_splats_and_splats_behind_the_camera_give_black(kind):
         assert len(total) == len(count) == len(some) and not count.any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 15), (33, 2), (3, 50)])
 def test_images_of_any_size(kind, size):
     shown, view = make("plain", kind, 1)
@@ -372,7 +372,7 @@ def test_images_of_any_size(kind, size):
     assert not different_gradients(render.backward(total), Reference().render(exact, view, NEAR).backward(total))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_what_is_seen_and_gradients_need_no_look_at_the_maps(kind):
     """A view is drawn when its maps are asked for, by the way back too."""
     shown, view = make("plain", kind, 2)
@@ -384,7 +384,7 @@ def test_what_is_seen_and_gradients_need_no_look_at_the_maps(kind):
     assert all(torch.equal(found[name], value) and value.any() for name, value in expected.items())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_a_splat_at_the_centre_of_the_camera_changes_nothing(kind):
     shown, view = make("plain", kind, 3)
     shown.means[3] = view.centre.float()
@@ -394,7 +394,7 @@ def test_a_splat_at_the_centre_of_the_camera_changes_nothing(kind):
     assert all(torch.isfinite(value).all() for value in gradients.tensors().values())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_near_hides_what_is_closer(kind):
     shown, view = make("plain", kind)
     pose = view.world_to_camera

@@ -10,7 +10,7 @@ from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.outlook import may_touch
 from surfkit.raster.reference import Reference
 
-from .scenes import KINDS, NEAR, Draw, camera, double, splats
+from .scenes import NEAR, PRIMITIVE_KINDS, Draw, camera, double, splats
 
 FORMS = [("surfel", {}), *(("gaussian", {"geometry": geometry}) for geometry in ("axis", "plane", "ray"))]
 FORMS += [("gaussian", {"dilation": 0.0}), ("gaussian", {"antialias": True, "dilation": 2.0})]
@@ -44,7 +44,7 @@ def test_nothing_that_is_seen_is_left_out(way, kind, form, seed):
 
 
 @needs_native
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_a_picture_is_the_same_without_the_others(kind):
     made, view = around(kind if kind in ("surfel", "gaussian") else "gaussian", 7)
     if kind == "ray":

@@ -14,8 +14,8 @@ from surfkit.raster.reference import Reference, draw
 from .plain import evaluate, harmonics, rotation
 from .scenes import (
     CASES,
-    KINDS,
     NEAR,
+    PRIMITIVE_KINDS,
     Draw,
     axis_camera,
     camera,
@@ -98,7 +98,7 @@ def test_everything_is_finite(name, kind):
     assert gradients.means.abs().sum() > 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_a_splat_at_the_centre_of_the_camera_gives_finite_gradients(kind):
     shown, view = make("plain", kind, degree=3)
     shown = rows(double(shown), slice(0, 8))
@@ -125,7 +125,7 @@ def test_float32_stays_finite_for_splats_of_almost_no_size(kind, antialias, shar
 
 
 @pytest.mark.parametrize("length", [1e-25, 1e25])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_the_length_of_a_quaternion_does_not_count(kind, length):
     shown, view = make("plain", kind)
     maps = [Reference().render(replace(shown, quats=q), view, NEAR).maps for q in (shown.quats, length * shown.quats)]
@@ -133,7 +133,7 @@ def test_the_length_of_a_quaternion_does_not_count(kind, length):
     assert (maps[0].color - maps[1].color).abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_hidden_splats_are_seen(kind):
     """Seen says where the footprint is, as in the native rasterizer; densification averages over it."""
     count, scales = 6, torch.tensor([3.0, 3.0, 0.3])[: 2 if kind == "surfel" else 3]
@@ -147,7 +147,7 @@ def test_hidden_splats_are_seen(kind):
     assert ((render.radii > 0) == render.seen).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_the_graph_of_a_view_holds_nothing_per_splat_and_pixel(kind):
     """Or a view of ordinary size would not fit into memory where there is no compiler."""
     shown, view = make("faint", kind)
@@ -379,7 +379,7 @@ def test_the_signal_of_surfels_is_the_slope_of_a_sideways_move():
             assert gradients.signal[i, axis].item() == pytest.approx(slope.item(), rel=1e-6, abs=1e-7)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_absolute_signals_are_sums_over_single_pixels(kind):
     shown, view = make("plain", kind, 0)
     shown, view = double(rows(shown, slice(0, 12))), crop(view, 20, 14, 20, 16)  # two tiles wide
@@ -405,7 +405,7 @@ def test_fewer_maps_are_the_same_maps():
         assert all(torch.equal(value, whole[name]) for name, value in made.items())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 def test_no_splats_and_splats_behind_the_camera_give_black(kind):
     shown, view = make("plain", kind)
     behind = shown.means - 5 * view.world_to_camera[2, :3].float()

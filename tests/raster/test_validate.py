@@ -9,7 +9,7 @@ from surfkit.core.check import BadInput
 from surfkit.raster.reference import Reference
 from surfkit.raster.validate import validate
 
-from .scenes import KINDS, NEAR, make
+from .scenes import NEAR, PRIMITIVE_KINDS, make
 
 NAN, INF = float("nan"), float("inf")
 
@@ -22,7 +22,7 @@ def spoilt(kind: str, name: str, row: int, value: float):
     return replace(shown, **{name: tensor}), view
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [

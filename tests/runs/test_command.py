@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.apps.train import Train
+from surfkit.apps.train import TrainCommand
 from surfkit.cli import main
 from surfkit.cli.parse import parse
 from surfkit.core.registry import offered_once
-from surfkit.io.datasets.data import Data, Reading
+from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.runs import stage
 from surfkit.runs.command import train_command
 from surfkit.runs.folder import Run, read_data
@@ -26,14 +26,14 @@ def stopped(tmp_path, monkeypatch):
     """A run, in a folder whose name has a blank, that was interrupted after two of four steps."""
     write_colmap(tmp_path / "my data", photograph(Flight(views=4, width=32, height=24, points=60)))
 
-    class Interrupting(stage.Display):
+    class Interrupting(stage.TrainingDisplay):
         def show(self, done):
             if done.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
 
     words = ["recipe:2dgs", *QUICK, "--data", str(tmp_path / "my data"), "--out", str(tmp_path / "my run")]
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "Display", Interrupting)
+        patch.setattr(stage, "TrainingDisplay", Interrupting)
         assert main(["train", *words]) == 130
     return tmp_path / "my run"
 
@@ -55,9 +55,9 @@ def test_the_command_reads_the_data_set_in_the_same_way(stopped):
         test_data=Path("tests"), metres_per_unit=0.1 + 0.2,
     )  # fmt: skip
     run = Run(stopped, opened(stopped).recipe, given)
-    found = parse(Train, shlex.split(train_command(run))[2:], "surfkit train")
+    found = parse(TrainCommand, shlex.split(train_command(run))[2:], "surfkit train")
     assert found.reading.of(found.data, 5) == given and found.out == stopped and found.recipe == run.recipe
-    assert read_data(stopped).scale == 1.5 and Reading().scale is None
+    assert read_data(stopped).scale == 1.5 and ReadSettings().scale is None
 
 
 def test_another_recipe_is_told_by_its_name(stopped, capsys):

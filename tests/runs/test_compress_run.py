@@ -20,7 +20,7 @@ from surfkit.io.splats.files import read_splat_file
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives import Surfel2D
 from surfkit.runs.blocks.schedule import Compute
-from surfkit.runs.compress import Target, fitted, importance_of
+from surfkit.runs.compress import CompressionTarget, fitted, importance_of
 from surfkit.runs.folder import discard_results
 from surfkit.runs.pipeline import loaded, run, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -235,5 +235,5 @@ def test_bisection_finds_the_largest_errors_that_fit():
         def coarser(self, factor):
             return Known(factor)
 
-    found = fitted(Known(), Target(bytes=300), lambda path, tried: 1000 / tried.factor)
+    found = fitted(Known(), CompressionTarget(bytes=300), lambda path, tried: 1000 / tried.factor)
     assert 3.333 <= found.factor < 3.6

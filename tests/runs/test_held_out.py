@@ -13,7 +13,7 @@ from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, write_json
-from surfkit.io.datasets.data import Data, Reading
+from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.io.datasets.read import read
 from surfkit.runs import warn
 from surfkit.runs.folder import Run, read_data
@@ -146,6 +146,6 @@ def test_rows_of_a_table_hold_out_the_same(folder):
     row = Row("b", {"test_every": 3})
     with pytest.raises(BadInput, match="row 'b': test_every: rows of a table hold out the same.*--test-every"):
         with_changes(table, row, table.base)
-    data = Reading().of(folder)
+    data = ReadSettings().of(folder)
     assert data.test_every == 8, "also where the recipe of a row is for a surface"
     assert fingerprint(replace(table.base, test_every=8), data, {}) == fingerprint(table.base, data, {})

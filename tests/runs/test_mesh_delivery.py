@@ -27,7 +27,7 @@ TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
     ("formats", "written"), [(["glb"], ["mesh.ply"]), (["glb", "obj"], ["mesh.obj"]), (["ply", "glb"], ["mesh.ply"])]
 )
 def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, written):
-    monkeypatch.setattr(glb, "MOST_BYTES", 500)
+    monkeypatch.setattr(glb, "MAX_GLB_BYTES", 500)
     told = []
     monkeypatch.setattr(delivering, "emit", told.append)
     run, subject = SimpleNamespace(out=tmp_path), SimpleNamespace(frame=Frame(np.zeros(3), 1.0))
@@ -41,9 +41,9 @@ def test_a_mesh_too_large_for_glb_is_not_lost(tmp_path, monkeypatch, formats, wr
 def test_the_length_of_a_glb_file_is_known_before_it_is_begun(tmp_path, monkeypatch):
     path = tmp_path / "mesh.glb"
     files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
-    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size)
+    monkeypatch.setattr(glb, "MAX_GLB_BYTES", path.stat().st_size)
     files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
-    monkeypatch.setattr(glb, "MOST_BYTES", path.stat().st_size - 1)
+    monkeypatch.setattr(glb, "MAX_GLB_BYTES", path.stat().st_size - 1)
     with pytest.raises(BadInput, match=f"mesh.glb: {path.stat().st_size} bytes"):
         files.write_mesh_glb(path, TRIANGLE, Frame(np.zeros(3), 1.0))
 

@@ -191,13 +191,13 @@ def test_a_file_in_the_place_of_the_folder_is_refused(data, recipe, tmp_path):
 def test_an_interrupted_run_goes_on_to_the_same_points(
     finished, data, recipe, tmp_path, monkeypatch, capsys, number, at
 ):
-    class Interrupting(stage.Display):
+    class Interrupting(stage.TrainingDisplay):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "Display", Interrupting)
+        patch.setattr(stage, "TrainingDisplay", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path)
     assert f"stopped after step {at} of 60; the same command goes on" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from forks import started
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.core.lock import USED, is_used, locked, mark_used
+from surfkit.core.lock import IN_USE_FILE, is_used, locked, mark_used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.patch_match import PatchMatch
@@ -349,8 +349,8 @@ def entry(cache, name, size, age):
     folder = cache / "depth" / name
     (folder / "estimated_depths").mkdir(parents=True)
     np.save(folder / "estimated_depths/a.npy", np.zeros(size, np.uint8))
-    (folder / USED).touch()
-    os.utime(folder / USED, (time.time() - age,) * 2)
+    (folder / IN_USE_FILE).touch()
+    os.utime(folder / IN_USE_FILE, (time.time() - age,) * 2)
     return folder
 
 

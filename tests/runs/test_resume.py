@@ -31,7 +31,7 @@ from surfkit.runs.recipe import complete
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train import step as train_step
-from surfkit.train.progress import Display
+from surfkit.train.progress import TrainingDisplay
 from surfkit.train.trainer import Trainer
 
 STEPS = 24
@@ -86,13 +86,13 @@ def steps(out):
 def interrupted(recipe, data, out, at, monkeypatch, **settings):
     """A run that is asked to stop after a step."""
 
-    class Interrupting(Display):
+    class Interrupting(TrainingDisplay):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr("surfkit.runs.stage.Display", Interrupting)
+        patch.setattr("surfkit.runs.stage.TrainingDisplay", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, out, **settings)
 
@@ -150,7 +150,7 @@ def test_a_longer_run_of_another_recipe_is_refused(done, whole_recipe, path, val
 
 
 def test_a_folder_in_use_is_refused(data, recipe, tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(lock, "LOCK_TIMEOUT_S", 0.0)
     with locked(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on \S+ works in it"):
         run(recipe, data, tmp_path / "run")
 
@@ -420,7 +420,7 @@ def test_a_disk_that_is_full_at_the_end(done, recipe, monkeypatch, name):
 
 
 def test_commands_on_a_run_folder_take_its_lock(done, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(lock, "LOCK_TIMEOUT_S", 0.0)
     _, out = done
     with locked(out):
         for words in (["evaluate", str(out)], ["export", str(out)]):

@@ -10,7 +10,7 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.events import StageBegan
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.trim import Trim
 from surfkit.io.datasets.fingerprint import fingerprint
 from surfkit.io.datasets.read import read
@@ -22,7 +22,7 @@ from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.shared import inputs_of, part_keys, read_shared
-from surfkit.runs.store import StageStore
+from surfkit.runs.store import StageCache
 from surfkit.study.recipes import RECIPES
 from surfkit.train import checkpoint
 
@@ -34,7 +34,7 @@ CHANGES = {
     "about": ({"about": "in other words"}, ""),
     "mesher": ({"mesh": TSDF(voxel=0.5)}, "mesh"),
     "compressor": ({"compress": Vectree(codes=16)}, "compress"),
-    "prune": ({"tune": replace(FULL.tune, prune=(Importance(at=(5,), ratio=0.5),))}, "tune mesh compress"),
+    "prune": ({"tune": replace(FULL.tune, prune=(PruneByImportance(at=(5,), ratio=0.5),))}, "tune mesh compress"),
     "trim": ({"tune": replace(FULL.tune, prune=(Trim(ratio=0.1),))}, "tune mesh compress"),
     "context": ({"context": "frozen"}, "tune mesh compress"),
     "min_views": ({"min_views": 7}, "plan tune mesh compress"),
@@ -57,10 +57,10 @@ def test_a_change_counts_from_the_part_that_it_belongs_to(name):
 
 def test_every_field_of_a_recipe_belongs_to_a_part():
     """A field that is added later must not be forgotten: it belongs to the first part where nothing else is said."""
-    named = {*shared.PLAN, *shared.TUNE, *shared.OTHERS}
+    named = {*shared.PLAN_FIELDS, *shared.TUNE_FIELDS, *shared.OTHER_FIELDS}
     assert named <= {each.name for each in fields(Recipe)}
     seen = {name for part in shared.parts(FULL) for name in (part.settings if isinstance(part.settings, dict) else ())}
-    assert {each.name for each in fields(Recipe)} - set(shared.OTHERS) <= seen
+    assert {each.name for each in fields(Recipe)} - set(shared.OTHER_FIELDS) <= seen
 
 
 def test_numbers_from_a_file_are_the_same_numbers():
@@ -111,7 +111,7 @@ def began():
 
 
 def test_a_second_run_takes_what_the_first_has_made(data, recipe, undisturbed, tmp_path, began, capsys):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     first = run(recipe, data, tmp_path / "a", Compute("cpu"), EVERY, store=store)
     assert began == ["pretrain", "tune 0", "tune 1"]
     began.clear()
@@ -140,7 +140,7 @@ def test_a_second_run_takes_what_the_first_has_made(data, recipe, undisturbed, t
 
 
 def test_other_blocks_begin_with_the_same_coarse_model(data, recipe, tmp_path, began):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     other = replace(recipe, tune=replace(recipe.tune, steps=recipe.tune.steps + 1))
     run(recipe, data, tmp_path / "a", Compute("cpu"), EVERY, store=store)
     began.clear()
@@ -155,7 +155,7 @@ def test_a_run_that_was_interrupted_goes_on_with_what_another_has_finished(data,
 
     from surfkit.runs import stage
 
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("surfkit.runs.pipeline.optimise", stop_after(stage.optimise, 6))
         run(recipe, data, tmp_path / "a", Compute("cpu"), EVERY, store=store)
@@ -167,7 +167,7 @@ def test_a_run_that_was_interrupted_goes_on_with_what_another_has_finished(data,
 
 
 def test_a_damaged_stage_is_computed_again(data, recipe, undisturbed, tmp_path, began):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     run(recipe, data, tmp_path / "a", Compute("cpu"), EVERY, store=store)
     for path in store.folder.glob("*/tune/checkpoint.safetensors"):
         content = path.read_bytes()
@@ -179,7 +179,7 @@ def test_a_damaged_stage_is_computed_again(data, recipe, undisturbed, tmp_path, 
 
 
 def test_blocks_that_were_reduced_are_not_shared(data, recipe, tmp_path, monkeypatch):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     state = replace(shared.read_state(tmp_path), reduced=("fewer points",))
     monkeypatch.setattr(shared, "read_state", lambda folder: state)
     run(recipe, data, tmp_path / "a", Compute("cpu"), EVERY, store=store)

@@ -8,7 +8,7 @@ from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.runs import store as store_module
-from surfkit.runs.store import RECORD, StageStore
+from surfkit.runs.store import ENTRY_RECORD, StageCache
 
 NAMES = ["events.jsonl", "pretrain/checkpoint.safetensors"]
 
@@ -37,7 +37,7 @@ def warnings():
 
 
 def test_what_is_put_is_found_and_taken(run, tmp_path):
-    store, other = StageStore(tmp_path / "stages"), tmp_path / "other"
+    store, other = StageCache(tmp_path / "stages"), tmp_path / "other"
     assert store.find("k1") is None
     store.put("k1", run, NAMES)
     store.find("k1").take(other)
@@ -48,7 +48,7 @@ def test_what_is_put_is_found_and_taken(run, tmp_path):
 
 
 def test_states_are_linked_and_journals_are_copied(run, tmp_path):
-    store, other = StageStore(tmp_path / "stages"), tmp_path / "other"
+    store, other = StageCache(tmp_path / "stages"), tmp_path / "other"
     store.put("k1", run, NAMES)
     store.find("k1").take(other)
     assert (other / NAMES[1]).samefile(run / NAMES[1]) and not (other / NAMES[0]).samefile(run / NAMES[0])
@@ -64,7 +64,7 @@ def test_files_are_copied_where_there_are_no_links(run, tmp_path, monkeypatch):
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr(store_module.os, "link", refuse)
-    store, other = StageStore(tmp_path / "stages"), tmp_path / "other"
+    store, other = StageCache(tmp_path / "stages"), tmp_path / "other"
     store.put("k1", run, NAMES)
     store.find("k1").take(other)
     assert (other / NAMES[1]).read_bytes() == b"state" and not (other / NAMES[1]).samefile(run / NAMES[1])
@@ -72,29 +72,29 @@ def test_files_are_copied_where_there_are_no_links(run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("damage", ["byte", "file", "record"])
 def test_a_damaged_entry_is_deleted_with_a_warning(run, tmp_path, warnings, damage):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     store.put("k1", run, NAMES)
     home = tmp_path / "stages" / "k1"
     if damage == "byte":
         (home / NAMES[1]).write_bytes(b"stale")
     else:
-        (home / (NAMES[1] if damage == "file" else RECORD)).unlink()
+        (home / (NAMES[1] if damage == "file" else ENTRY_RECORD)).unlink()
     assert store.find("k1") is None and not home.exists()
     assert len(warnings) == 1 and warnings[0].startswith("a stored stage is damaged and is computed again: ")
 
 
 def test_what_a_dead_process_left_is_never_an_entry(run, tmp_path):
-    store = StageStore(tmp_path / "stages")
+    store = StageCache(tmp_path / "stages")
     left = tmp_path / "stages" / ".surfkit-k1.77.part"
     left.mkdir(parents=True)
-    (left / RECORD).write_text(json.dumps({}))
+    (left / ENTRY_RECORD).write_text(json.dumps({}))
     assert store.find("k1") is None
     store.sweep()
     assert not left.exists()
 
 
 def test_the_first_of_two_processes_stays(run, tmp_path, monkeypatch):
-    store, rename = StageStore(tmp_path / "stages"), store_module.os.rename
+    store, rename = StageCache(tmp_path / "stages"), store_module.os.rename
 
     def late(part, home):
         monkeypatch.setattr(store_module.os, "rename", rename)

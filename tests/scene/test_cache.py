@@ -8,7 +8,7 @@ import pytest
 from surfkit.core.check import BadInput
 from surfkit.scene import memory
 from surfkit.scene.cache import Cache, share
-from surfkit.scene.gate import Gate
+from surfkit.scene.gate import ByteSemaphore
 from surfkit.scene.memory import cache_bytes, free_bytes
 
 
@@ -148,7 +148,7 @@ def test_a_smaller_budget_lets_go_at_once():
 
 
 def test_a_gate_lets_in_what_fits_and_one_that_does_not():
-    gate, taken, most = Gate(100), [0], [0]
+    gate, taken, most = ByteSemaphore(100), [0], [0]
     lock, both = threading.Lock(), threading.Barrier(2)
 
     def work(count):
@@ -170,7 +170,7 @@ def test_a_gate_lets_in_what_fits_and_one_that_does_not():
 
 
 def test_no_two_large_ones_are_in_a_gate():
-    gate = Gate(100)
+    gate = ByteSemaphore(100)
     entered = threading.Event()
 
     def work():
@@ -225,10 +225,10 @@ def test_limits_of_control_groups_are_respected(tmp_path, monkeypatch, version):
         f"anon 3\n{'total_inactive_file' if version == 1 else 'inactive_file'} 200000\n"
     )
     (tmp_path / "own").write_text("4:cpu,memory:/outer/inner\n" if version == 1 else "0::/outer/inner\n")
-    monkeypatch.setattr(memory, "GROUPS", tmp_path)
-    monkeypatch.setattr(memory, "OWN", tmp_path / "own")
+    monkeypatch.setattr(memory, "CGROUP_ROOT", tmp_path)
+    monkeypatch.setattr(memory, "PROCESS_CGROUP", tmp_path / "own")
     assert free_bytes() == 1_200_000 and cache_bytes("auto") == 600_000
-    monkeypatch.setattr(memory, "OWN", tmp_path / "none")
+    monkeypatch.setattr(memory, "PROCESS_CGROUP", tmp_path / "none")
     assert free_bytes() > 1_200_000
 
 

@@ -7,7 +7,7 @@ from grids import plane, write_gtx
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.scene.earth import Site, from_utm, on_earth, to_ecef, utm
+from surfkit.scene.earth import LocalEarthFrame, from_utm, on_earth, to_ecef, utm
 from surfkit.scene.geoid import geoid_of
 
 LOCAL = "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"
@@ -40,7 +40,7 @@ def test_utm_and_back_again():
 
 def test_a_topocentric_site_is_its_own_frame():
     xyz = np.array([[0, 0, 0], [200.0, -50, 7]])
-    site = Site.at(LOCAL, np.zeros(3))
+    site = LocalEarthFrame.at(LOCAL, np.zeros(3))
     np.testing.assert_allclose(site.local(xyz), xyz, rtol=0, atol=1e-6)
     assert site.unit == pytest.approx(1, abs=1e-9)
     phi, lam = np.radians([47.5, 8.9])
@@ -51,7 +51,7 @@ def test_a_topocentric_site_is_its_own_frame():
 
 def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
     origin = np.array([640000.0, 5783000.0, 100.0])  # 140 km from the meridian: the grid turns by 1.6 degrees
-    site = Site.at("EPSG:32634", origin)
+    site = LocalEarthFrame.at("EPSG:32634", origin)
     east, north, up = site.local(origin + 100 * np.eye(3))
     np.testing.assert_allclose(east, [100 / 0.99984, 0, 0.0008], atol=2e-3)
     np.testing.assert_allclose(north, [0, 100 / 0.99984, 0.0008], atol=2e-3)
@@ -73,12 +73,12 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
 )
 def test_what_has_no_place_is_refused_in_one_line(crs, text):
     with pytest.raises(BadInput, match=text) as caught:
-        Site.at(crs, np.array([1e6, 6e6, 430.0]))
+        LocalEarthFrame.at(crs, np.array([1e6, 6e6, 430.0]))
     assert "\n" not in str(caught.value)
 
 
 def test_other_systems_are_placed_by_pyproj():
-    assert Site.at("EPSG:25832", np.array([5e5, 5.3e6, 0])).unit == pytest.approx(1.0003, abs=1e-4)
+    assert LocalEarthFrame.at("EPSG:25832", np.array([5e5, 5.3e6, 0])).unit == pytest.approx(1.0003, abs=1e-4)
 
 
 PLACE = np.array([451_234.5, 5_873_456.25, 37.0])  # 8.273207 east, 53.008438 north
@@ -135,7 +135,7 @@ def test_without_a_vertical_part_heights_are_above_the_ellipsoid_of_the_datum_an
         wanted = known.transform(*place[:2], place[2] * metres)
         np.testing.assert_allclose(ellipsoidal(convert(np.array([place]))), wanted, rtol=0, atol=1e-6)
         assert f"{crs} does not say what heights are above" in notes[0] and "--geoid" in notes[0]
-    assert Site.at("EPSG:2263", np.array(place)).unit == pytest.approx(1200 / 3937, rel=1e-4)
+    assert LocalEarthFrame.at("EPSG:2263", np.array(place)).unit == pytest.approx(1200 / 3937, rel=1e-4)
 
 
 def test_a_datum_that_is_placed_roughly_only_is_told():

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.scene import photos
 from surfkit.scene.camera import Camera
-from surfkit.scene.copies import Copies
+from surfkit.scene.copies import DecodedPhotoCache
 from surfkit.scene.photos import is_turned, photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 
@@ -156,25 +156,25 @@ def test_copies_on_disk_are_the_same_pixels_and_made_once(tmp_path, monkeypatch)
     views = [view(path) for path in paths]
     wanted = [read_photo(path, (8, 6)) for path in paths]
     for _ in range(2):
-        cache = photo_cache(views, 0, Copies(tmp_path))
+        cache = photo_cache(views, 0, DecodedPhotoCache(tmp_path))
         assert all(torch.equal(cache[at], wanted[at]) for at in (0, 1, 0))
     made = sorted((tmp_path / "resized").iterdir())
     assert [path.name[:2] for path in made] == ["a-", "b-"]
     with monkeypatch.context() as patch:
         patch.setattr(photos, "read_photo", None)  # decoding again would fail
-        assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[1], wanted[1])
+        assert torch.equal(photo_cache(views, 0, DecodedPhotoCache(tmp_path))[1], wanted[1])
     made[0].write_bytes(made[0].read_bytes()[:-5])  # damaged: made again
-    assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[0], wanted[0])
+    assert torch.equal(photo_cache(views, 0, DecodedPhotoCache(tmp_path))[0], wanted[0])
     save(paths[1], 255 - stripes(40, 30))  # another photograph of that name
-    assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[1], read_photo(paths[1], (8, 6)))
+    assert torch.equal(photo_cache(views, 0, DecodedPhotoCache(tmp_path))[1], read_photo(paths[1], (8, 6)))
     assert len(list((tmp_path / "resized").iterdir())) == 3
     paths[0].unlink()
     with pytest.raises(BadInput, match="a.png: no such photograph"):
-        photo_cache(views, 0, Copies(tmp_path))[0]
+        photo_cache(views, 0, DecodedPhotoCache(tmp_path))[0]
 
 
 def test_large_photographs_are_decoded_one_after_the_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(photos.GATE, "most", 3 * 40 * 30)
+    monkeypatch.setattr(photos.DECODE_GATE, "most", 3 * 40 * 30)
     inside, most = [0], [0]
     original = photos.to_rgb
 

@@ -242,7 +242,7 @@ def test_what_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
 
 def test_large_photographs_are_read(tmp_path, monkeypatch):
     """What is large, and Pillow's own limit, are set low: the same happens to 150 megapixels, and takes longer."""
-    monkeypatch.setattr(large, "ORDINARY", 1000)
+    monkeypatch.setattr(large, "MAX_UNCHECKED_PIXELS", 1000)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 500)
     for end in ("png", "jpg", "tif"):
         picture(640, 480).save(tmp_path / f"a.{end}")
@@ -252,25 +252,25 @@ def test_large_photographs_are_read(tmp_path, monkeypatch):
     sizes = []
     open_picture(tmp_path / "a.jpg", lambda image: sizes.append(image.size), (64, 48))
     assert sizes == [(160, 120)], "a large JPEG is never held at its full size"
-    need = large.DECODED * 640 * 480 + large.MADE * 64 * 48
-    monkeypatch.setattr(large, "free_bytes", lambda: int(need / large.ROOM) - 1)
+    need = large.DECODED_PIXEL_BYTES * 640 * 480 + large.RESULT_PIXEL_BYTES * 64 * 48
+    monkeypatch.setattr(large, "free_bytes", lambda: int(need / large.DECODE_MEMORY_SHARE) - 1)
     read_photo(tmp_path / "a.jpg", (64, 48))
     with pytest.raises(BadInput, match="a.png: 640 x 480 px"):
         read_photo(tmp_path / "a.png", (64, 48))
-    monkeypatch.setattr(large, "free_bytes", lambda: int(need / large.ROOM) + 1)
+    monkeypatch.setattr(large, "free_bytes", lambda: int(need / large.DECODE_MEMORY_SHARE) + 1)
     read_photo(tmp_path / "a.png", (64, 48))
 
 
 def test_the_user_sets_the_limit(tmp_path, monkeypatch):
     picture(640, 480).save(tmp_path / "a.png")
     monkeypatch.setattr(large, "free_bytes", lambda: 0)
-    monkeypatch.setattr(large, "ORDINARY", 1000)
-    monkeypatch.setenv(large.LIMIT, "0.4")
+    monkeypatch.setattr(large, "MAX_UNCHECKED_PIXELS", 1000)
+    monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, "0.4")
     read_photo(tmp_path / "a.png", (64, 48))
-    monkeypatch.setenv(large.LIMIT, "0.3")
+    monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, "0.3")
     with pytest.raises(BadInput, match="more than the limit SURFKIT_MAX_MEGAPIXELS=0.3"):
         read_photo(tmp_path / "a.png", (64, 48))
     for wrong in ("much", "-1", "nan", "inf"):
-        monkeypatch.setenv(large.LIMIT, wrong)
+        monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, wrong)
         with pytest.raises(BadInput, match=f"SURFKIT_MAX_MEGAPIXELS={wrong}: give"):
             read_photo(tmp_path / "a.png", (64, 48))

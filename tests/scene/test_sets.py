@@ -1,11 +1,11 @@
 import numpy as np
 
-from surfkit.scene.sets import FEW, is_among
+from surfkit.scene.sets import MAX_CACHED_NUMBERS, is_among
 
 
 def test_as_the_sets_of_python() -> None:
     draw = np.random.default_rng(0)
-    for size in (0, 1, 2, 50, 1000, 4 * FEW):
+    for size in (0, 1, 2, 50, 1000, 4 * MAX_CACHED_NUMBERS):
         values, others = draw.integers(-size, size, size), draw.integers(0, size + 1, size // 2)
         for some, those in ((values, others), (others, values)):
             known = set(those.tolist())

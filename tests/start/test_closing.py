@@ -15,14 +15,14 @@ from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.start import carve, closing
 from surfkit.start.base import StartInput
-from surfkit.start.carve import Grid, Votes, meet, solid_of, votes
+from surfkit.start.carve import CarvingGrid, Votes, meet, solid_of, votes
 from surfkit.start.closing import not_seen_through
 from surfkit.start.stereo import StereoStart
 from surfkit.start.voxels import Samples
 from surfkit.testing import synthetic
-from surfkit.testing.synthetic import Box, Flight, Ground, photograph
+from surfkit.testing.synthetic import Box, Flight, GroundPlane, photograph
 
-ALLEY = (Ground(), Box((-5.0, -4.0, 0.0), (-1.0, 4.0, 4.0)), Box((1.0, -4.0, 0.0), (5.0, 4.0, 4.0)))
+ALLEY = (GroundPlane(), Box((-5.0, -4.0, 0.0), (-1.0, 4.0, 4.0)), Box((1.0, -4.0, 0.0), (5.0, 4.0, 4.0)))
 """Two houses, 2 m apart and 4 m high."""
 
 
@@ -94,7 +94,7 @@ def test_depth_that_is_not_trusted_is_used_where_nothing_contradicts_it(town):
 
 
 def test_points_that_more_see_through_than_see_are_left_out():
-    grid = Grid(np.array([1.0, 2.0, 3.0]), np.eye(3)[[1, 2, 0]], 0.5, (4, 3, 2))
+    grid = CarvingGrid(np.array([1.0, 2.0, 3.0]), np.eye(3)[[1, 2, 0]], 0.5, (4, 3, 2))
     surfaces, through = np.zeros((2, 4, 3, 2), np.uint8)
     through[1, 2, 1], through[3, 0, 0], surfaces[3, 0, 0] = 1, 2, 2
     voxels = np.array([[1, 2, 1], [3, 0, 0], [0, 1, 1], [4, 0, 0], [0, -1, 0]])
@@ -139,7 +139,7 @@ def test_nothing_is_added_where_all_depth_is_trusted_or_masked(town):
 def test_points_that_are_further_apart_in_a_large_scene_are_told(town, monkeypatch):
     given = known(town)
     stereo = StereoStart(points=6_000).fused(given)
-    monkeypatch.setattr(Grid.around.__func__, "__defaults__", (20_000,))
+    monkeypatch.setattr(CarvingGrid.around.__func__, "__defaults__", (20_000,))
     told = []
     monkeypatch.setattr(closing, "emit", told.append)
     StereoStart(points=20_000, closing=0.2).closed(given, stereo)
@@ -177,7 +177,7 @@ def scattered(seed):
     draw = np.random.default_rng(seed)
     axes = np.linalg.qr(draw.normal(size=(3, 3)))[0]
     axes *= np.linalg.det(axes)
-    grid = Grid(draw.normal(size=3), axes, 0.1, (17, 12, 9))
+    grid = CarvingGrid(draw.normal(size=3), axes, 0.1, (17, 12, 9))
     middle = grid.origin + axes.T @ (0.5 * grid.side * np.array(grid.size))
     maps = []
     for _ in range(6):
@@ -222,7 +222,7 @@ def test_counts_end_at_255():
 
 
 def test_rays_meet_a_wall_where_it_is():
-    grid = Grid(np.zeros(3), np.eye(3), 0.5, (40, 40, 40))
+    grid = CarvingGrid(np.zeros(3), np.eye(3), 0.5, (40, 40, 40))
     solid = np.zeros(grid.size, np.uint8)
     solid[:, :, 30:] = 1  # from z = 14.75 on
     pose = torch.eye(4, dtype=torch.float64)
@@ -235,7 +235,7 @@ def test_rays_meet_a_wall_where_it_is():
 
 def test_a_grid_stays_within_its_number_of_voxels():
     points = np.random.default_rng(0).uniform(-50, 50, (5000, 3))
-    small, large = Grid.around(points, np.eye(3), 1.0), Grid.around(points, np.eye(3), 1.0, most=30_000)
+    small, large = CarvingGrid.around(points, np.eye(3), 1.0), CarvingGrid.around(points, np.eye(3), 1.0, most=30_000)
     assert small.side == 1.0 and np.prod(large.size) <= 30_000 and large.side > 1.0
     low = large.origin
     high = large.origin + large.side * (np.array(large.size) - 1)

@@ -12,13 +12,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.core.registry import components
 from surfkit.io.datasets.depth_prior import DepthPrior
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.start.base import Start, StartInput
 from surfkit.start.depth_points import normals_of
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.splats import SplatStart
 from surfkit.start.stereo import StereoStart, pixel_size
-from surfkit.start.voxels import Collected, Samples, apart, thin, thin_to
+from surfkit.start.voxels import Samples, VoxelAccumulator, apart, thin, thin_to
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
 
@@ -155,7 +155,7 @@ def test_maps_may_show_all_sparse_points(farm):
     stereo = StereoStart(points=2_000).fused(given)
     some = torch.from_numpy(stereo.xyz[:5]).float()
     for count in (5, 0):
-        cloud = Cloud(some[:count], torch.zeros(count, 3, dtype=torch.uint8))
+        cloud = SparsePoints(some[:count], torch.zeros(count, 3, dtype=torch.uint8))
         begun = StereoStart(points=2_000).cloud(replace(given, scene=replace(given.scene, cloud=cloud)))
         assert len(begun.xyz) == len(begun.size) == len(stereo)
 
@@ -212,7 +212,7 @@ def plane(count, rng, z=0.0):
 def test_memory_is_bounded_and_nothing_is_lost_by_it():
     rng = np.random.default_rng(0)
     parts = [plane(20_000, rng) for _ in range(6)]
-    kept = Collected(1e-3, 5_000)
+    kept = VoxelAccumulator(1e-3, 5_000)
     for part in parts:
         kept.add(part)
     voxels = kept.settle()
@@ -229,7 +229,7 @@ def test_what_is_far_lies_in_larger_voxels_and_gives_way_to_what_was_seen_nearby
     near, far = plane(40_000, rng), plane(40_000, rng, z=0.0)
     near = Samples(**{name: value[near.xyz[:, 0] < 0] for name, value in vars(near).items()})
     far = replace(far, grain=np.full(40_000, 0.16))
-    kept = Collected(0.02, 1 << 20)
+    kept = VoxelAccumulator(0.02, 1 << 20)
     kept.add(near)
     kept.add(far)
     found = thin(kept.settle(), 0.02)
@@ -275,7 +275,7 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
 
     draw = torch.Generator().manual_seed(0)
     normals = normalize(torch.randn(9, 3, generator=draw), dim=1)
-    cloud = Cloud(torch.rand(9, 3), torch.zeros(9, 3, dtype=torch.uint8), normals, torch.linspace(0.1, 0.9, 9))
+    cloud = SparsePoints(torch.rand(9, 3), torch.zeros(9, 3, dtype=torch.uint8), normals, torch.linspace(0.1, 0.9, 9))
     cloud = replace(cloud, size=torch.linspace(1, 9, 9))
     for primitive in (Surfel2D(), Gaussian3D()):
         splats = primitive.activate(primitive.init(cloud, draw), 0)

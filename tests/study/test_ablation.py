@@ -11,7 +11,7 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins, reload
 from surfkit.core.tree import evolve
 from surfkit.densify.filters import Elongation
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import LossGradient
 from surfkit.densify.trim import Trim
 from surfkit.losses.depth import DepthRegression
@@ -20,10 +20,19 @@ from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe, without_unused
 from surfkit.study import ablation
 from surfkit.study.ablation import Row, Table, build, built_on, limit_points, offered_tables, pick, scaled
-from surfkit.study.columns import COLUMNS, OF_MESH
+from surfkit.study.columns import MESH_COLUMNS, TABLE_COLUMNS
 from surfkit.study.compare import compare
 from surfkit.study.recipes import city, surface
-from surfkit.study.recipes.ablations import COARSE_BASELINE, GRADIENT, METHODS, MODEL, PARTITION, SURFACE, TABLES, TRIM
+from surfkit.study.recipes.ablations import (
+    COARSE_BASELINE,
+    GRADIENT_TABLE,
+    METHODS_TABLE,
+    MODEL_TABLE,
+    PARTITION_TABLE,
+    SURFACE_TABLE,
+    TABLES,
+    TRIM_TABLE,
+)
 from surfkit.study.recipes.surface import STEREO
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
@@ -49,7 +58,7 @@ def test_every_row_is_a_recipe(name, label):
     assert with_steps(recipe, 600).length == 600
     short = scaled(recipe, table, 600)
     assert short.length == round(600 * recipe.length / (table.base.length or 1))
-    if table in (MODEL, GRADIENT) and label != "CityGaussian":
+    if table in (MODEL_TABLE, GRADIENT_TABLE) and label != "CityGaussian":
         assert short.pretrain.densify.until == 300 and short.pretrain.losses["normal"].start == 140
         assert short.tune.steps == 600, "also where pretraining is shorter"
     assert label in recipe.about and name in recipe.about
@@ -66,30 +75,30 @@ def test_every_row_changes_what_it_is_built_on(name, label):
     for path, value in row.change.items():
         before = evolve(before, path, value)
     assert without_unused(before) == replace(after, about=before.about)
-    if table is METHODS:
+    if table is METHODS_TABLE:
         assert (row.recipe is None) == (below is None), "the first row is the base, the others are recipes"
-    elif table in (SURFACE, TRIM, PARTITION):
+    elif table in (SURFACE_TABLE, TRIM_TABLE, PARTITION_TABLE):
         assert (before == (build(table)[below] if below else table.base)) == (below is None), "a row changes something"
     else:
         assert after.pretrain.policies, "these tables are about how points multiply"
 
 
 def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_wants_its_maps():
-    recipes = build(SURFACE)
-    last = [row.label for row in SURFACE.rows if row.kept][-1]
+    recipes = build(SURFACE_TABLE)
+    last = [row.label for row in SURFACE_TABLE.rows if row.kept][-1]
     assert recipes[last] == replace(surface.SURFACE, about=recipes[last].about, test_every=8)
     first, *others, alone = recipes.values()
     assert first.depth is None and "depth" not in first.pretrain.losses and first.pretrain.densify is not None
     assert all(recipe.depth is not None and recipe.mesh is not None for recipe in others)
-    assert alone == replace(STEREO, about=alone.about, test_every=8) and scaled(alone, SURFACE, 2_000) == alone
+    assert alone == replace(STEREO, about=alone.about, test_every=8) and scaled(alone, SURFACE_TABLE, 2_000) == alone
     assert limit_points(recipes[last], 500).start.most == 500
 
 
 @pytest.mark.parametrize("name", ["model", "gradient"])
 def test_every_row_has_its_published_figures(name):
     known = (
-        set(COLUMNS)
-        - {"cpu_seconds", "peak_gpu_bytes", *OF_MESH}
+        set(TABLE_COLUMNS)
+        - {"cpu_seconds", "peak_gpu_bytes", *MESH_COLUMNS}
         - ({"bytes", "peak_memory_bytes", "fps"} if name == "gradient" else set())
     )
     for row in TABLES[name].rows:
@@ -108,12 +117,12 @@ def test_every_row_has_its_published_figures(name):
 
 
 def test_published_differences_are_those_that_the_paper_writes_about():
-    rows = {row["label"]: row["paper_difference"] for row in compare(MODEL, {})}
+    rows = {row["label"]: row["paper_difference"] for row in compare(MODEL_TABLE, {})}
     dgd = rows["+ DGD"]
     assert (dgd["psnr"], dgd["ssim"], dgd["f1"]) == (1.06, 0.038, 0.018), "1.0 PSNR, 0.04 SSIM, and almost 0.02 F1"
     assert rows["+ SH degree 2"]["fps"] == pytest.approx(3.2) and "fps" not in rows["control: one block"]
     assert rows["+ prune (LightGaussian)"]["psnr"] == -0.04, "it excludes trim, which stands above it"
-    papers = {row.label: row.paper for row in MODEL.rows}
+    papers = {row.label: row.paper for row in MODEL_TABLE.rows}
     assert papers["+ trim (Ours-b)"]["bytes"] / papers["+ parallel tuning"]["bytes"] == pytest.approx(0.42, abs=0.01)
     assert papers["+ VQ (Ours-s)"]["bytes"] / papers["+ SH degree 2"]["bytes"] == pytest.approx(0.34, abs=0.01)
 
@@ -134,7 +143,7 @@ def test_rows_build_on_the_last_kept_one():
 
 
 def test_the_model_table_adds_up():
-    recipes = build(MODEL)
+    recipes = build(MODEL_TABLE)
     stages = [recipe.pretrain for recipe in recipes.values()][:4]
     assert [bool(stage.densify.filters) for stage in stages] == [False, True, True, True]
     dgd = LossGradient(terms=("ssim",), boost=0.9)
@@ -145,17 +154,21 @@ def test_the_model_table_adds_up():
         found = recipes[label]
         return replace(found, about="", mesh=None, **others) == replace(recipe, about="", mesh=None, **others)
 
-    assert same("+ depth regression", city.COARSE)
+    assert same("+ depth regression", city.CITY_COARSE)
     tenth = (Trim(ratio=0.1),)
     assert same("+ trim (Ours-b)", replace(city.CITY, tune=replace(city.CITY.tune, prune=tenth)))
-    assert same("+ VQ (Ours-s)", replace(city.SMALL, tune=replace(city.SMALL.tune, prune=tenth)))
-    assert same("+ 7k pretrain (Ours-t)", replace(city.TINY, tune=replace(city.TINY.tune, prune=tenth)))
+    assert same("+ VQ (Ours-s)", replace(city.CITY_SMALL, tune=replace(city.CITY_SMALL.tune, prune=tenth)))
+    assert same("+ 7k pretrain (Ours-t)", replace(city.CITY_TINY, tune=replace(city.CITY_TINY.tune, prune=tenth)))
     assert same("+ parallel tuning", replace(city.CITY, tune=replace(city.CITY.tune, prune=())))
     assert same("control: one block", replace(recipes["+ parallel tuning"], partition=ContractedGrid(blocks=(1, 1))))
-    assert same("CityGaussian", city.FIRST)
+    assert same("CityGaussian", city.CITY_FIRST)
     pruned = recipes["+ prune (LightGaussian)"].tune.prune
-    assert [type(part) for part in pruned] == [Importance], "without trim: the two exclude each other"
-    assert built_on(MODEL)["+ prune (LightGaussian)"] == "+ parallel tuning" == built_on(MODEL)["+ trim (Ours-b)"]
+    assert [type(part) for part in pruned] == [PruneByImportance], "without trim: the two exclude each other"
+    assert (
+        built_on(MODEL_TABLE)["+ prune (LightGaussian)"]
+        == "+ parallel tuning"
+        == built_on(MODEL_TABLE)["+ trim (Ours-b)"]
+    )
     planned = recipes["+ partition of 2DGS"].partition_pretrain
     assert planned.steps == 7_000 and planned.signal.terms is None and "depth" not in planned.losses
     assert planned.densify == COARSE_BASELINE.pretrain.densify and planned.losses == COARSE_BASELINE.pretrain.losses
@@ -163,13 +176,13 @@ def test_the_model_table_adds_up():
 
 
 def test_the_gradient_table_changes_the_signal_and_then_the_loss():
-    stages = [recipe.pretrain for recipe in build(GRADIENT).values() if recipe.has_stages]
+    stages = [recipe.pretrain for recipe in build(GRADIENT_TABLE).values() if recipe.has_stages]
     terms = [None, ("ssim", "l1"), ("ssim", "normal"), ("ssim",), ("ssim",), ("ssim", "depth")]
     assert [stage.signal for stage in stages] == [LossGradient(terms=names) for names in terms]
     assert ["depth" in stage.losses for stage in stages] == [False] * 4 + [True] * 2
     same = [evolve(evolve(stage, "signal", LossGradient()), "losses", {}) for stage in stages]
     assert all(stage == same[0] for stage in same) and same[0].densify.filters == (Elongation(),)
-    assert list(built_on(GRADIENT).values()) == [
+    assert list(built_on(GRADIENT_TABLE).values()) == [
         None,
         *["SSIM + RGB + normal"] * 3,
         "SSIM",
@@ -235,7 +248,7 @@ def test_packages_add_rows_to_tables_of_others(monkeypatch):
     finally:
         reload()
     rows = tables["methods"].rows
-    assert rows[: len(METHODS.rows)] == METHODS.rows and rows[-1] == Row("ours", {"seed": 3})
+    assert rows[: len(METHODS_TABLE.rows)] == METHODS_TABLE.rows and rows[-1] == Row("ours", {"seed": 3})
     labels = [row.label for row in tables["trim"].rows]
     assert labels[-2:] == ["ours", "stereo alone"], "what has no splats stays apart from what has"
     assert "lost" not in tables

@@ -1,7 +1,7 @@
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.study.columns import COLUMNS, refuse_unknown_columns, shown_columns
+from surfkit.study.columns import TABLE_COLUMNS, refuse_unknown_columns, shown_columns
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from surfkit.study.columns import COLUMNS, refuse_unknown_columns, shown_columns
     ],
 )
 def test_numbers_have_their_digits_and_units(name, value, spread, text):
-    assert COLUMNS[name].text(value, spread) == text
+    assert TABLE_COLUMNS[name].text(value, spread) == text
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_numbers_have_their_digits_and_units(name, value, spread, text):
     ],
 )
 def test_differences_are_absolute_or_in_percent(name, value, base, error, text):
-    assert COLUMNS[name].difference(value, base, error) == text
+    assert TABLE_COLUMNS[name].difference(value, base, error) == text
 
 
 def test_columns_are_those_that_were_measured_but_lpips_only_if_it_is_named():
@@ -44,7 +44,7 @@ def test_columns_are_those_that_were_measured_but_lpips_only_if_it_is_named():
 
 
 def test_names_of_columns_are_checked():
-    refuse_unknown_columns(list(COLUMNS))
+    refuse_unknown_columns(list(TABLE_COLUMNS))
     with pytest.raises(BadInput, match="--columns: no column named 'time'; known: ssim, psnr, .*, fps"):
         refuse_unknown_columns(["psnr", "time"])
     with pytest.raises(BadInput, match="psnr is there twice"):

@@ -12,7 +12,7 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.recipe import Recipe
 from surfkit.study.ablation import Row, Table
-from surfkit.study.study import Plan, ablate, report_so_far
+from surfkit.study.study import AblationPlan, ablate, report_so_far
 from surfkit.study.truth import Truth
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -38,9 +38,9 @@ def test_its_mesh_is_made_and_measured_once(tmp_path):
     rows = (Row("plain"), Row("+ VQ", {"compress": Vectree(ratio=1.0, codes=2)}))
     table, out = Table("small", "", base, rows), tmp_path / "out"
     data = (Data(tmp_path / "data"),)
-    first = ablate(Plan(table, data, out, device="cpu"), Silent())
+    first = ablate(AblationPlan(table, data, out, device="cpu"), Silent())
     mesh = out / rows_in(first)[0]["runs"][0]["folder"] / "mesh.ply"
-    plan = Plan(table, data, out, device="cpu", truth=(Truth(mesh, 0.05),))
+    plan = AblationPlan(table, data, out, device="cpu", truth=(Truth(mesh, 0.05),))
     plain, small = rows_in(ablate(plan, Silent()))
     assert plain["failed"] is None and small["failed"] is None, (plain["failed"], small["failed"])
     assert plain["mean"]["f1"] > 0.99 and 0 <= small["mean"]["f1"] < plain["mean"]["f1"]
@@ -50,5 +50,5 @@ def test_its_mesh_is_made_and_measured_once(tmp_path):
     assert noted["compressed"]["geometry"]["f1"] == small["mean"]["f1"] and "geometry" not in noted
     assert small["mean"]["bytes"] == (folder / "compressed" / "model.surfkit").stat().st_size < plain["mean"]["bytes"]
     assert rows_in(report_so_far(plan)) == [plain, small], "it is known to be measured"
-    other = Plan(table, data, out, device="cpu", truth=(Truth(mesh, 0.1),))
+    other = AblationPlan(table, data, out, device="cpu", truth=(Truth(mesh, 0.1),))
     assert all("f1" not in row["mean"] for row in rows_in(report_so_far(other))), "that was with another threshold"

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.evaluate.geometry.chart import Line, write_lines
+from surfkit.evaluate.geometry.chart import PlotLine, write_lines
 
 BLUE, ORANGE = (31, 119, 180), (255, 127, 14)
 
@@ -64,7 +64,9 @@ def test_a_chart_has_the_same_bytes_under_any_name_and_style(tmp_path, monkeypat
 
     steps = np.arange(1, 5.0)
     for name in ("a", "b"):
-        write_lines(tmp_path / name, [Line("_10$ run$", steps, steps), Line("x" * 80, steps, 0 * steps)], "$", "steps")
+        write_lines(
+            tmp_path / name, [PlotLine("_10$ run$", steps, steps), PlotLine("x" * 80, steps, 0 * steps)], "$", "steps"
+        )
         monkeypatch.setitem(matplotlib.rcParams, "figure.facecolor", "red")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     picture = np.asarray(Image.open(tmp_path / "a").convert("RGB")).astype(int)

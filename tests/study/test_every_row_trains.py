@@ -6,7 +6,7 @@ import torch
 
 from surfkit.io.datasets.data import Data
 from surfkit.study.recipes.ablations import TABLES
-from surfkit.study.study import Plan, ablate
+from surfkit.study.study import AblationPlan, ablate
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = pytest.mark.usefixtures("quick_comparison")
@@ -50,7 +50,7 @@ def cache(tmp_path_factory):
 @pytest.mark.parametrize("name", TABLES)
 def test_every_row_trains(farm, out, name):
     rows = tuple(row.label for row in TABLES[name].rows)
-    report = ablate(Plan(TABLES[name], (farm,), out, steps=2, rows=rows, device="cpu"), Silent())
+    report = ablate(AblationPlan(TABLES[name], (farm,), out, steps=2, rows=rows, device="cpu"), Silent())
     (found,) = report["data_sets"]
     for row in found["rows"]:
         assert row["failed"] is None, row

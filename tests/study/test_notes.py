@@ -15,7 +15,7 @@ from surfkit.runs.folder import read_record
 from surfkit.runs.methods.stereo import StereoFusion
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.store import StageStore
+from surfkit.runs.store import StageCache
 from surfkit.start.stereo import StereoStart
 from surfkit.study.notes import lines_on_depth, notes_of, row_numbers
 from surfkit.study.rows import Trial
@@ -112,7 +112,7 @@ def test_rows_of_several_devices_are_told_apart(data, tmp_path):
 
 def test_a_run_that_takes_a_stage_notes_what_was_switched_off_in_it(data, tmp_path):
     stage = Stage(steps=2, losses=Stage().losses | {"depth": DepthRegression()})
-    store, recipe = StageStore(tmp_path / "stages"), Recipe(pretrain=stage)
+    store, recipe = StageCache(tmp_path / "stages"), Recipe(pretrain=stage)
     for name, about in (("made", ""), ("taken", "again")):
         run(replace(recipe, about=about), data, tmp_path / name, store=store)
     made, taken = (read_record(tmp_path / name)["notes"] for name in ("made", "taken"))

@@ -10,7 +10,7 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.densify import ADC, Importance, Trim
+from surfkit.densify import ADC, PruneByImportance, Trim
 from surfkit.densify.base import Prune, Signal
 from surfkit.densify.signal import LossGradient
 from surfkit.io.datasets.data import Data
@@ -66,9 +66,9 @@ def test_no_steps_are_refused():
 
 def test_citygs2_coarse_is_the_last_row_of_the_upper_half_of_the_ablation_table():
     from surfkit.study.ablation import build
-    from surfkit.study.recipes.ablations import MODEL
+    from surfkit.study.recipes.ablations import MODEL_TABLE
 
-    last = build(MODEL)["+ depth regression"]
+    last = build(MODEL_TABLE)["+ depth regression"]
     assert replace(recipes()["citygs2-coarse"], about=last.about, mesh=last.mesh) == last
     assert last.pretrain.signal.boost == 0.9 and last.pretrain.signal.terms == ("ssim",)
 
@@ -82,7 +82,7 @@ def test_published_settings_of_the_other_recipes():
     assert (trim.ratio, trim.start, trim.until, trim.every, trimmed.steps) == (0.1, 31_000, 37_000, 500, 37_000)
     pruned, distilled = known["lightgaussian"].refine
     drop = pruned.stage.prune[0]
-    assert drop == Importance(at=(0,), ratio=0.66, power=0.1, score="significance") and distilled.sh_degree == 2
+    assert drop == PruneByImportance(at=(0,), ratio=0.66, power=0.1, score="significance") and distilled.sh_degree == 2
     assert (light.steps, pruned.stage.steps, distilled.stage.steps) == (30_000, 5_000, 5_000)
     assert known["lightgaussian"].compress == Vectree(ratio=0.6, codes=8192)
 

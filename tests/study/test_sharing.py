@@ -20,7 +20,7 @@ from surfkit.apps.forecast import foretell, needs_of, stage_steps
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.io.datasets.data import Data
 from surfkit.mesh.tsdf import TSDF
 from surfkit.runs.execute.base import Job, JobResult, Pool
@@ -28,9 +28,9 @@ from surfkit.runs.pipeline import run
 from surfkit.study import rows
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes.surface import SURFACE
-from surfkit.study.rows import OUTCOME, Outcome, Work, main, outcome_of
+from surfkit.study.rows import OUTCOME_FILE, TrialJob, TrialResult, main, outcome_of
 from surfkit.study.sharing import finished_keys, keys_of, next_wave, sharing_lines
-from surfkit.study.study import Plan, ablate, trials
+from surfkit.study.study import AblationPlan, ablate, trials
 
 __all__ = ["data", "recipe"]
 
@@ -67,7 +67,7 @@ def table_of(recipe) -> Table:
         recipe,
         (
             Row("base"),
-            Row("prune", {"tune.prune": (Importance(at=(6,), ratio=0.5),)}, kept=False),
+            Row("prune", {"tune.prune": (PruneByImportance(at=(6,), ratio=0.5),)}, kept=False),
             Row("mesh", {"mesh": TSDF()}),
             Row("VQ", {"compress": Vectree(codes=16)}),
         ),
@@ -83,7 +83,7 @@ def table(recipe) -> Table:
 def whole(table, data, tmp_path_factory):
     """The table in this process, in its folder, with its report."""
     out = tmp_path_factory.mktemp("whole")
-    return out, ablate(Plan(table, (data,), out, device="cpu"), Silent())
+    return out, ablate(AblationPlan(table, (data,), out, device="cpu"), Silent())
 
 
 def counts(report):
@@ -110,7 +110,7 @@ def test_shared_stages_are_computed_once_and_nothing_changes(whole, table, data,
     assert sorted(counts(report), key=str) == sorted(STAGES, key=str)
     told = "pretrain computed once, used by 4 runs: base, prune, mesh, VQ"
     assert sharing_lines(report)[0] == told and f"- {told}\n" in (out / "ablation.md").read_text()
-    for trial in trials(Plan(table, (data,), out, device="cpu")):
+    for trial in trials(AblationPlan(table, (data,), out, device="cpu")):
         alone = tmp_path / trial.label
         metrics = run(trial.recipe, data, alone, rows.Compute("cpu"))
         shared = json.loads((trial.folder / "metrics.json").read_text())
@@ -124,7 +124,7 @@ def test_shared_stages_are_computed_once_and_nothing_changes(whole, table, data,
 
 
 def test_without_sharing_each_row_computes_all(whole, table, data, tmp_path):
-    report = ablate(Plan(table, (data,), tmp_path, rows=("1", "3"), device="cpu", shared=False), Silent())
+    report = ablate(AblationPlan(table, (data,), tmp_path, rows=("1", "3"), device="cpu", shared=False), Silent())
     assert report["stages"] == [] and not (tmp_path / "stages").exists()
     found, wanted = digests(tmp_path), digests(whole[0])
     assert found and all(wanted[name] == value for name, value in found.items())
@@ -133,7 +133,7 @@ def test_without_sharing_each_row_computes_all(whole, table, data, tmp_path):
 @pytest.mark.usefixtures("forked_jobs")
 def test_a_pool_gives_the_same_and_computes_shared_stages_once(whole, table, data, tmp_path):
     watch = Silent()
-    report = ablate(Plan(table, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), watch)
+    report = ablate(AblationPlan(table, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), watch)
     assert digests(tmp_path) == digests(whole[0])
     assert sorted(counts(report), key=str) == sorted(STAGES, key=str)
     assert watch.begun == ["base", "prune", "mesh", "VQ"] and watch.ended[0] == "base" and watch.ended[-1] == "VQ"
@@ -142,7 +142,7 @@ def test_a_pool_gives_the_same_and_computes_shared_stages_once(whole, table, dat
 
 
 def test_waves_compute_no_stage_twice(table, data, tmp_path):
-    every = trials(Plan(table, (data,), tmp_path, seeds=2))
+    every = trials(AblationPlan(table, (data,), tmp_path, seeds=2))
     first = next_wave(every, set())
     assert [(trial.label, trial.seed) for trial in first] == [("base", 0), ("base", 1)]
     keys = {trial.label: keys_of(trial) for trial in every if trial.seed == 0}
@@ -179,7 +179,7 @@ def kill_and_continue(data: Data, out: Path) -> int:
             with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
                 try:
                     kill.Deadly(out, 0 if kills > 7 else draw.randint(60, 260)).install()
-                    ablate(Plan(table, (data,), out, device="cpu"), Silent())
+                    ablate(AblationPlan(table, (data,), out, device="cpu"), Silent())
                     os._exit(0)
                 finally:
                     os._exit(70)
@@ -192,8 +192,8 @@ def kill_and_continue(data: Data, out: Path) -> int:
 
 
 def test_a_worker_whose_driver_is_gone_stops(table, data, tmp_path, monkeypatch):
-    (trial,) = trials(Plan(table, (data,), tmp_path, rows=("1",)))[:1]
-    job = rows.job_of(0, Work(trial, tmp_path, "cpu"))
+    (trial,) = trials(AblationPlan(table, (data,), tmp_path, rows=("1",)))[:1]
+    job = rows.job_of(0, TrialJob(trial, tmp_path, "cpu"))
     monkeypatch.setenv("SURFKIT_DRIVER", "1" if os.getppid() != 1 else "2")
 
     def forever(work):
@@ -201,26 +201,26 @@ def test_a_worker_whose_driver_is_gone_stops(table, data, tmp_path, monkeypatch)
             time.sleep(3600)
 
     monkeypatch.setattr(rows, "attempt", forever)
-    assert main([job.command[-1]]) == 130 and not (trial.folder / OUTCOME).exists()
+    assert main([job.command[-1]]) == 130 and not (trial.folder / OUTCOME_FILE).exists()
 
 
 def test_what_becomes_of_a_process_that_dies(table, data, tmp_path):
-    trial = trials(Plan(table, (data,), tmp_path))[0]
-    work = Work(trial, tmp_path)
+    trial = trials(AblationPlan(table, (data,), tmp_path))[0]
+    work = TrialJob(trial, tmp_path)
     job = Job(0, trial.folder, lambda: 0, ())
     assert outcome_of(work, JobResult(job, -9, kind="oom")).failed == (
         f"its process ended by SIGKILL while memory ran out; see {trial.folder / 'log.txt'}"
     )
     assert outcome_of(work, JobResult(job, 2, "machine m: no disk")).failed == "machine m: no disk"
     assert outcome_of(work, JobResult(job, 130)).failed.startswith("its process ended with status 130; see ")
-    rows.write_json(trial.folder / OUTCOME, Outcome({"psnr": 1.5, "points": 7}, "no mesh"))
-    assert outcome_of(work, JobResult(job, 0)) == Outcome({"psnr": 1.5, "points": 7}, "no mesh")
+    rows.write_json(trial.folder / OUTCOME_FILE, TrialResult({"psnr": 1.5, "points": 7}, "no mesh"))
+    assert outcome_of(work, JobResult(job, 0)) == TrialResult({"psnr": 1.5, "points": 7}, "no mesh")
 
 
 @pytest.mark.usefixtures("forked_jobs")
 def test_a_row_that_fails_in_a_pool_does_not_stop_the_others(table, data, tmp_path):
     broken = replace(table, rows=(Row("bad", {"start": SURFACE.start}, kept=False), table.rows[0]))
-    report = ablate(Plan(broken, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), Silent())
+    report = ablate(AblationPlan(broken, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), Silent())
     bad, base = report["data_sets"][0]["rows"]
     assert bad["failed"].startswith(f"seed 0: {data.path}: the start of the recipe needs depth maps")
     assert base["mean"]["psnr"] > 0 and not base["failed"]
@@ -228,7 +228,7 @@ def test_a_row_that_fails_in_a_pool_does_not_stop_the_others(table, data, tmp_pa
 
 def test_two_processes_on_one_table(table, data, tmp_path):
     with locked(tmp_path), pytest.raises(BadInput, match=f"{tmp_path}: process {os.getpid()} on .* works in it; wait"):
-        ablate(Plan(table, (data,), tmp_path, device="cpu"), Silent())
+        ablate(AblationPlan(table, (data,), tmp_path, device="cpu"), Silent())
     assert not (tmp_path / "ablation.json").exists()
 
 
@@ -238,7 +238,7 @@ def test_data_sets_side_by_side(table, data, tmp_path):
     write_colmap(tmp_path / "other", photograph(Flight(kind="grid", views=16, width=32, height=24, points=200)))
     other = Data(tmp_path / "other")
     watch = Silent()
-    report = ablate(Plan(table, (data, other), tmp_path / "out", rows=("1", "3"), device="cpu"), watch)
+    report = ablate(AblationPlan(table, (data, other), tmp_path / "out", rows=("1", "3"), device="cpu"), watch)
     assert watch.begun == ["base", "mesh"] * 2
     one, two = report["data_sets"]
     assert [one["data"]["path"], two["data"]["path"]] == [str(data.path.resolve()), str(other.path)]
@@ -247,13 +247,13 @@ def test_data_sets_side_by_side(table, data, tmp_path):
     page = (tmp_path / "out" / "ablation.md").read_text()
     assert page.count("# table:shares") == 1 and f"Data: {data.path.name}, other;" in page
     with pytest.raises(BadInput, match="is there twice"):
-        Plan(table, (data, data), tmp_path)
+        AblationPlan(table, (data, data), tmp_path)
     with pytest.raises(BadInput, match="1 ground truths for 2 data sets; give one for each"):
-        Plan(table, (data, other), tmp_path, truth=(object(),))
+        AblationPlan(table, (data, other), tmp_path, truth=(object(),))
 
 
 def test_a_forecast_counts_shared_stages_once(table, data, tmp_path, capsys, forked_probe):
-    plan = Plan(table, (data,), tmp_path, device="cpu")
+    plan = AblationPlan(table, (data,), tmp_path, device="cpu")
     every = trials(plan)
     assert stage_steps(every[0].recipe) == {"pretrain": 12, "tune": 24}
     needs = needs_of(every, set(), True)

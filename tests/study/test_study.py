@@ -16,7 +16,7 @@ from surfkit.core.registry import find
 from surfkit.densify import CountCap, Elongation
 from surfkit.densify.base import Prune
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.depth_prior import OFF
+from surfkit.io.datasets.depth_prior import SWITCHED_OFF
 from surfkit.io.datasets.fingerprint import fingerprint as data_fingerprint
 from surfkit.io.datasets.read import read
 from surfkit.losses.depth import DepthRegression
@@ -25,15 +25,24 @@ from surfkit.runs.folder import Run
 from surfkit.runs.methods.stereo import StereoFusion
 from surfkit.study import rows
 from surfkit.study.ablation import Row, Table, build
-from surfkit.study.recipes.ablations import COARSE_BASELINE, MODEL, TABLES, stereo_alone
+from surfkit.study.recipes.ablations import COARSE_BASELINE, MODEL_TABLE, TABLES, stereo_alone
 from surfkit.study.recipes.surface import STEREO
-from surfkit.study.rows import Outcome
-from surfkit.study.screen import Screen
-from surfkit.study.study import Plan, ablate, fingerprint, report_of, report_so_far, run_folder, trials, unfinished
+from surfkit.study.rows import TrialResult
+from surfkit.study.screen import AblationScreen
+from surfkit.study.study import (
+    AblationPlan,
+    ablate,
+    fingerprint,
+    report_of,
+    report_so_far,
+    run_folder,
+    trials,
+    unfinished,
+)
 from surfkit.study.table import lines, markdown
 from surfkit.study.truth import Truth
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.progress import Display
+from surfkit.train.progress import TrainingDisplay
 
 TABLE = Table(
     "twins",
@@ -99,7 +108,7 @@ def runs(monkeypatch):
 
 def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
     watch = Silent()
-    report = ablate(Plan(TABLE, (data,), tmp_path, steps=300, seeds=2), watch)
+    report = ablate(AblationPlan(TABLE, (data,), tmp_path, steps=300, seeds=2), watch)
     assert runs.calls == [(3, 0), (1, 0), (3, 1), (1, 1)]
     assert watch.begun == [("base", 0, 1, 4), ("less | more", 0, 2, 4), ("base", 1, 3, 4), ("less | more", 1, 4, 4)]
     base, same, less = rows_in(report)
@@ -113,9 +122,9 @@ def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
 
 
 def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
-    plan = Plan(MODEL, (data,), tmp_path, max_points=500)
+    plan = AblationPlan(MODEL_TABLE, (data,), tmp_path, max_points=500)
     recipes = [trial.recipe for trial in trials(plan) if trial.label != "stereo alone"]
-    assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * (len(MODEL.rows) - 1)
+    assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * (len(MODEL_TABLE.rows) - 1)
     assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
     stages = [(path, stage) for recipe in recipes for path, stage, _ in recipe.stages() if stage.densify is not None]
     assert {path for path, _ in stages} == {"pretrain", "partition_pretrain", "tune"}, "in blocks, too"
@@ -130,7 +139,7 @@ def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
 
 def test_rows_that_make_a_mesh_alone_are_run_where_meshes_are_compared(data, tmp_path):
     table = replace(TABLE, rows=(*TABLE.rows, stereo_alone(on="base")))
-    plan = Plan(table, (data,), tmp_path, steps=300)
+    plan = AblationPlan(table, (data,), tmp_path, steps=300)
     assert [trial.label for trial in unfinished(plan)] == ["base", "less | more"]
     compared = replace(plan, truth=(Truth(data.path, 1.0),))
     for wanted in (compared, replace(plan, rows=("stereo alone",))):
@@ -147,7 +156,7 @@ def test_every_table_has_stereo_alone_as_its_baseline(name):
 
 
 def test_what_is_saved(data, runs, tmp_path):
-    report = ablate(Plan(TABLE, (data,), tmp_path, steps=300, seeds=2), Silent())
+    report = ablate(AblationPlan(TABLE, (data,), tmp_path, steps=300, seeds=2), Silent())
     assert json.loads((tmp_path / "ablation.json").read_text()) == report
     assert (report["table"], report["steps"], report["seeds"]) == ("twins", 300, 2)
     assert report["data_sets"][0]["data"]["path"] == str(data.path)
@@ -164,9 +173,9 @@ def test_what_is_saved(data, runs, tmp_path):
 
 
 def test_an_interrupted_table_goes_on(data, runs, tmp_path):
-    whole = ablate(Plan(TABLE, (data,), tmp_path / "whole", seeds=2), Silent())
+    whole = ablate(AblationPlan(TABLE, (data,), tmp_path / "whole", seeds=2), Silent())
     runs.raises = {(3, 1): KeyboardInterrupt()}
-    plan = Plan(TABLE, (data,), tmp_path / "broken", seeds=2)
+    plan = AblationPlan(TABLE, (data,), tmp_path / "broken", seeds=2)
     with pytest.raises(KeyboardInterrupt):
         ablate(plan, Silent())
     half = json.loads((plan.out / "ablation.json").read_text())
@@ -177,7 +186,7 @@ def test_an_interrupted_table_goes_on(data, runs, tmp_path):
 
 
 def test_a_finished_table_needs_nothing(data, runs, tmp_path):
-    plan = Plan(TABLE, (data,), tmp_path)
+    plan = AblationPlan(TABLE, (data,), tmp_path)
     first = ablate(plan, Silent())
     runs.calls = []
     assert ablate(plan, Silent()) == first and runs.calls == []
@@ -191,7 +200,7 @@ def test_a_finished_table_needs_nothing(data, runs, tmp_path):
 def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_path):
     """Photographs were replaced after some rows were finished: the others would be trained on what is there now."""
     write_colmap(tmp_path / "scene", photograph(Flight(views=9, width=24, height=18, points=40)))
-    plan = Plan(TABLE, (Data(tmp_path / "scene"),), tmp_path / "out")
+    plan = AblationPlan(TABLE, (Data(tmp_path / "scene"),), tmp_path / "out")
     first = ablate(plan, Silent())
     for trial in trials(plan):
         write_json(trial.folder / "inputs.json", data_fingerprint(read(trial.data)))
@@ -206,23 +215,23 @@ def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_p
 
 
 def test_a_row_that_draws_nothing_is_done_without_lpips(data, tmp_path):
-    plan = Plan(TABLE, (data,), tmp_path, columns=("lpips",))
+    plan = AblationPlan(TABLE, (data,), tmp_path, columns=("lpips",))
     trial, spent = trials(plan)[0], {"seconds": 1.0, "cpu_seconds": 1.0}
-    assert plan.is_done(trial, Outcome(spent)) and not plan.is_done(trial, Outcome())
-    assert not plan.is_done(trial, Outcome(spent | {"psnr": 20.0}))
-    assert plan.is_done(trial, Outcome(spent | {"psnr": 20.0, "lpips": 0.3}))
+    assert plan.is_done(trial, TrialResult(spent)) and not plan.is_done(trial, TrialResult())
+    assert not plan.is_done(trial, TrialResult(spent | {"psnr": 20.0}))
+    assert plan.is_done(trial, TrialResult(spent | {"psnr": 20.0, "lpips": 0.3}))
 
 
 def test_some_rows_now_and_the_others_later(data, runs, tmp_path):
-    report = ablate(Plan(TABLE, (data,), tmp_path, rows=("3",)), Silent())
+    report = ablate(AblationPlan(TABLE, (data,), tmp_path, rows=("3",)), Silent())
     assert runs.calls == [(1, 0)] and rows_in(report)[0]["runs"] == [] and rows_in(report)[2]["difference"] == {}
-    report = ablate(Plan(TABLE, (data,), tmp_path, rows=("same",)), Silent())
+    report = ablate(AblationPlan(TABLE, (data,), tmp_path, rows=("same",)), Silent())
     assert runs.calls == [(1, 0), (3, 0)] and rows_in(report)[2]["difference"]["psnr"]["mean"] == 3
 
 
 def test_a_row_that_fails_does_not_stop_the_others(data, runs, tmp_path):
     runs.raises = {(3, 0): RuntimeError("step 7:\n  the losses are nan")}
-    plan = Plan(TABLE, (data,), tmp_path, seeds=2)
+    plan = AblationPlan(TABLE, (data,), tmp_path, seeds=2)
     report = ablate(plan, Silent())
     assert runs.calls == [(3, 0), (1, 0), (1, 1)], "a failed row is not tried with other seeds"
     base, same, less = rows_in(report)
@@ -240,12 +249,12 @@ def test_a_row_that_fails_does_not_stop_the_others(data, runs, tmp_path):
 
 def test_input_that_a_single_run_refuses_fails_its_row(data, runs, tmp_path):
     runs.raises = {(1, 0): BadInput("no depth\nprior")}
-    report = ablate(Plan(TABLE, (data,), tmp_path), Silent())
+    report = ablate(AblationPlan(TABLE, (data,), tmp_path), Silent())
     assert rows_in(report)[2]["failed"] == "seed 0: no depth prior" and not list(tmp_path.rglob("failed.txt"))
 
 
 def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs, tmp_path):
-    plan = Plan(TABLE, (data,), tmp_path / "out")
+    plan = AblationPlan(TABLE, (data,), tmp_path / "out")
     for wrong, message in (
         (replace(plan, data=(Data(tmp_path / "nowhere"),)), "no such folder"),
         (replace(plan, data=(replace(data, test_every=0),)), "no photograph is kept from training"),
@@ -293,7 +302,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
     vertices = "".join(f"{x} {y} 0\n" for x in range(20) for y in range(20))
     head = "ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\n"
     gt.write_text(f"{head}end_header\n{vertices}")
-    plan = Plan(TABLE, (data,), tmp_path / "out", truth=(truth.Truth(gt, 0.5),))
+    plan = AblationPlan(TABLE, (data,), tmp_path / "out", truth=(truth.Truth(gt, 0.5),))
     assert all(trial.recipe.mesh is not None for trial in trials(plan)), "rows without a mesh get one"
     report = ablate(plan, Silent())
     assert [row["mean"]["f1"] for row in rows_in(report)] == [0.25, 0.25, 0.5]
@@ -372,18 +381,18 @@ def test_rows_that_could_not_run_as_named_are_blank_and_marked(data, tmp_path, m
     def run_it(recipe, data, folder, *_args, **_kwargs):
         write_json(folder / "metrics.json", made)
         lacks = Run(folder, recipe, data).wants_priors
-        write_json(folder / "run.json", {"notes": [f"no depth priors, so {OFF}"] if lacks else []})
+        write_json(folder / "run.json", {"notes": [f"no depth priors, so {SWITCHED_OFF}"] if lacks else []})
         return made
 
     monkeypatch.setattr(rows.pipeline, "run", run_it)
     losses = COARSE_BASELINE.pretrain.losses | {"depth": DepthRegression()}
     rows_with_depth = (Row("plain"), Row("depth", {"pretrain.losses": losses}))
     table = Table("depths", "Depth", COARSE_BASELINE, rows_with_depth)
-    report = ablate(Plan(table, (data,), tmp_path / "out"), Silent())
+    report = ablate(AblationPlan(table, (data,), tmp_path / "out"), Silent())
     plain, depth = rows_in(report)
     assert plain["mean"]["psnr"] == 20 and plain["not_as_named"] is None
     assert depth["mean"] == {} and "depth map" in depth["not_as_named"] and depth["failed"] is None
-    assert [run["folder"] for run in depth["runs"]] and not unfinished(Plan(table, (data,), tmp_path / "out"))
+    assert [run["folder"] for run in depth["runs"]] and not unfinished(AblationPlan(table, (data,), tmp_path / "out"))
     first, second = csv.DictReader((tmp_path / "out/ablation.csv").open())
     assert first["psnr"] == "20.0" and not first["not_as_named"]
     assert second["psnr"] == "" and "depth map" in second["not_as_named"] and second["folder"]
@@ -422,7 +431,7 @@ def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
 
     class Training(Runs):
         def __call__(self, recipe, data, out, device, **rest):
-            with Display("pretrain", 1, console) as display:
+            with TrainingDisplay("pretrain", 1, console) as display:
                 assert display.bar is None, "no second live display"
                 display.outer("pretrain", 1, 1, "step 1/1")
             return super().__call__(recipe, data, out, device, **rest)
@@ -430,17 +439,17 @@ def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
     training = Training()
     training.raises = {(1, 0): RuntimeError("too bad")}
     monkeypatch.setattr(rows.pipeline, "run", training)
-    with Screen(console) as screen:
-        ablate(Plan(TABLE, (data,), tmp_path), screen)
+    with AblationScreen(console) as screen:
+        ablate(AblationPlan(TABLE, (data,), tmp_path), screen)
     text = out.getvalue()
     assert "run 1 of 2: base, seed 0" in text and "step 1/1" in text and "━" in text
     assert "21.12" in text and "run 2 of 2: less | more, seed 0: failed: RuntimeError: too bad" in text
-    assert Display("pretrain", 1).outer is None
+    assert TrainingDisplay("pretrain", 1).outer is None
 
 
 def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
-    with Screen(Console(file=io.StringIO())) as screen:
-        ablate(Plan(TABLE, (data,), tmp_path), screen)
+    with AblationScreen(Console(file=io.StringIO())) as screen:
+        ablate(AblationPlan(TABLE, (data,), tmp_path), screen)
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 4 and said[0].startswith("run 1 of 2: base, seed 0, in ")
     assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"
@@ -472,7 +481,7 @@ def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
     meshes = tuple(others.OtherMesh.parsed(f"{name}={tmp_path}/{name}.ply") for name in ("good", "bad"))
     table = replace(TABLE, rows=TABLE.rows[:1], columns=("components", "crossing_share"))
     known = truth.Truth(tmp_path / "gt.ply", 0.5)
-    plan = Plan(table, (data,), tmp_path / "out", rows=("base",), truth=(known,), meshes=meshes)
+    plan = AblationPlan(table, (data,), tmp_path / "out", rows=("base",), truth=(known,), meshes=meshes)
     monkeypatch.setattr("surfkit.study.study.unfinished", lambda plan: [])
     report = ablate(plan, Silent())
     base, good, bad = rows_in(report)
@@ -508,4 +517,6 @@ def test_meshes_that_cannot_be_rows(data, tmp_path, words, change, message):
     (tmp_path / "gt.ply").write_text("a truth")
     with pytest.raises(BadInput, match=message):
         meshes = tuple(others.OtherMesh.parsed(word.format(f=tmp_path)) for word in words)
-        Plan(TABLE, (data,), tmp_path, **{"truth": (truth.Truth(tmp_path / "gt.ply", 0.5),), **change}, meshes=meshes)
+        AblationPlan(
+            TABLE, (data,), tmp_path, **{"truth": (truth.Truth(tmp_path / "gt.ply", 0.5),), **change}, meshes=meshes
+        )

@@ -13,7 +13,7 @@ from surfkit.core.tree import evolve
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
 from surfkit.study.ablation import build, built_on
-from surfkit.study.columns import COLUMNS
+from surfkit.study.columns import TABLE_COLUMNS
 from surfkit.study.recipes import RECIPES
 from surfkit.study.table_file import is_table_file, read_table
 
@@ -141,5 +141,5 @@ def test_the_tables_in_the_pages(tmp_path):
     (text,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
     steps = build(read_table(str(written(tmp_path, text, "steps.py"))))
     assert [recipe.pretrain.steps for recipe in steps.values()] == [7_000, 30_000]
-    for name in COLUMNS:
+    for name in TABLE_COLUMNS:
         assert f"`{name}`" in page

@@ -9,7 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import COLUMNS
+from surfkit.io.splats.table import SPLAT_COLUMNS
 from surfkit.testing import check_format
 
 
@@ -22,7 +22,7 @@ class Saved(Format):
     def write(self, path, table, frame=None, tree=None):
         table.refuse_unsound(path)
         table = self.spoilt(replace(table, means=table.file_means(frame)))
-        values = [table.kind, *(getattr(table, name) for name in COLUMNS)]
+        values = [table.kind, *(getattr(table, name) for name in SPLAT_COLUMNS)]
         torch.save({"values": values}, path)
 
     def spoilt(self, table):

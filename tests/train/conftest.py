@@ -9,7 +9,7 @@ import torch
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Tiny:
 
     views: tuple[View, ...]
     photos: list[torch.Tensor]
-    cloud: Cloud
+    cloud: SparsePoints
     rasterizer: Rasterizer
     truth: Splats
 
@@ -51,7 +51,7 @@ def tiny() -> Tiny:
     views = tuple(View(f"{i}.png", camera, Path(f"{i}.png")) for i, camera in enumerate(cameras))
     images = [rasterizer.render(truth, camera, 0.005, geometry=False).maps.color for camera in cameras]
     photos = [(image.clamp(0, 1) * 255).round().to(torch.uint8) for image in images]
-    cloud = Cloud(means + 0.01 * torch.randn(count, 3, generator=draw), (colors * 255).to(torch.uint8))
+    cloud = SparsePoints(means + 0.01 * torch.randn(count, 3, generator=draw), (colors * 255).to(torch.uint8))
     return Tiny(views, photos, cloud, rasterizer, truth)
 
 

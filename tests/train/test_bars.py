@@ -5,7 +5,7 @@ import io
 from rich.console import Console
 
 from surfkit.core.events import Progress, emit
-from surfkit.train.bars import Bars, bars
+from surfkit.train.bars import ProgressBars, bars
 from surfkit.train.progress import outer
 
 
@@ -20,7 +20,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then():
 
 def test_on_a_terminal_there_is_a_bar_that_ends():
     said = io.StringIO()
-    shown = Bars(Console(file=said, force_terminal=True, width=100))
+    shown = ProgressBars(Console(file=said, force_terminal=True, width=100))
     for at in range(1, 4):
         shown.surfkit_event(Progress("fusing tiles", at, 3))
         assert (shown.live is None) == (at == 3)

@@ -166,7 +166,7 @@ def test_all_of_a_state_comes_back(begin, tmp_path):
     state.sh_degree, state.halvings, state.skipped, state.reset_at = 1, 2, [3], 7
     save(tmp_path / "c.safetensors", state)
     again = load(tmp_path / "c.safetensors")
-    assert all(getattr(again, name) == getattr(state, name) for name in checkpoint.SCALARS)
+    assert all(getattr(again, name) == getattr(state, name) for name in checkpoint.SCALAR_FIELDS)
 
 
 def test_columns_that_do_not_fit_are_named(begin, tmp_path):

@@ -17,7 +17,7 @@ from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, simulated_gpu
 from surfkit.train.data_cache import TrainingData
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.stage import Stage
-from surfkit.train.uploads import Shown, Uploads
+from surfkit.train.uploads import UploadedView, Uploads
 
 STAGE = Stage(steps=14, losses={"l1": L1(), "ssim": SSIM()}, densify=ADC(start=2, until=12, every=5, threshold=1e-5))
 BIG = 10**9
@@ -161,7 +161,9 @@ def test_on_a_cpu_nothing_is_kept_or_read_ahead(tiny):
     order = type("Order", (), {"queue": torch.arange(6), "at": 0})()
     uploads.ahead(order, ())
     found = uploads.get(1)
-    assert isinstance(found, Shown) and found.photo is tiny.photos[1] and photos.read == [1] and uploads.bytes == 0
+    assert (
+        isinstance(found, UploadedView) and found.photo is tiny.photos[1] and photos.read == [1] and uploads.bytes == 0
+    )
 
 
 @pytest.mark.parametrize("within", [1, 30, 60])

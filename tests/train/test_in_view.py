@@ -15,7 +15,7 @@ from surfkit.primitives.points import Points
 from surfkit.train import checkpoint
 from surfkit.train.adam import UPDATED
 from surfkit.train.faults import Diverged
-from surfkit.train.in_view import InView
+from surfkit.train.in_view import PointsInView
 from surfkit.train.stage import Stage
 
 from .conftest import looking_down
@@ -56,7 +56,7 @@ def held(points):
 def visible(trainer, state, done):
     """(N,) what the view of a step may show, of points as they are."""
     camera = done.target.view.camera
-    rows = InView.of(trainer.primitive, state.points.params, camera, trainer.rasterizer, trainer.stage.near).rows
+    rows = PointsInView.of(trainer.primitive, state.points.params, camera, trainer.rasterizer, trainer.stage.near).rows
     return torch.zeros(len(state.points), dtype=torch.bool).index_fill(0, rows, True)
 
 

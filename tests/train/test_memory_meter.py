@@ -9,7 +9,7 @@ from surfkit.core.events import MemoryTaken
 from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import peak_memory_bytes, reset_peak_memory
 from surfkit.core.registry import plugins
-from surfkit.runs.notes import Notes
+from surfkit.runs.notes import RunNotes
 from surfkit.train.memory_meter import MemoryMeter
 
 LARGE = 300_000_000
@@ -61,7 +61,7 @@ def test_each_stage_has_its_own_peak_and_the_run_the_highest(resettable, heard):
     for parts in (before, *after):
         assert sum(parts.values()) == 2 * parts["peak"] and min(parts.values()) >= 0
     assert 0.05 * LARGE < after[0]["pictures"] < 0.2 * LARGE
-    notes = Notes()
+    notes = RunNotes()
     for event in heard:
         notes.surfkit_event(event)
     assert notes.memory == between

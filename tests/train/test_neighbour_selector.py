@@ -15,10 +15,10 @@ from surfkit.primitives.columns import RATES
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
-from surfkit.train.neighbour_selector import CHOICE, NeighbourSelector
+from surfkit.train.neighbour_selector import NEIGHBOURS_PER_VIEW, NeighbourSelector
 from surfkit.train.next_view import neighbour
 from surfkit.train.stage import Stage
 from surfkit.train.trainer import Trainer
@@ -47,7 +47,7 @@ def test_neighbours_stand_at_an_angle_see_the_same_and_are_as_far():
     cameras += [facing(10, away=True), replace(facing(12), cx=-900.0)]
     depth = torch.full((30, 40), 2.0)
     chosen = NeighbourSelector.of(cameras).neighbours(0, depth)
-    assert set(chosen[:2]) == {2, 3} and set(chosen[2:]) <= {4} and len(chosen) <= CHOICE
+    assert set(chosen[:2]) == {2, 3} and set(chosen[2:]) <= {4} and len(chosen) <= NEIGHBOURS_PER_VIEW
     assert NeighbourSelector.of(cameras[:2]).neighbours(0, depth) == [], "no parallax"
     assert NeighbourSelector.of(cameras).neighbours(0, torch.zeros(30, 40)) == [], "nothing rendered"
     assert NeighbourSelector.of(cameras[:1]).neighbours(0, depth) == []
@@ -125,7 +125,7 @@ def world():
         xyz.append((pose[:3, :3].T @ ((view.camera.rays(torch.float64) * truth.depth)[:, there] - pose[:3, 3:])).T)
         normals.append((pose[:3, :3].T @ truth.normal[:, there]).T)
         rgb.append((truth.color[:, there].T * 255).to(torch.uint8))
-    return views, photos, Cloud(torch.cat(xyz).float(), torch.cat(rgb), torch.cat(normals).float())
+    return views, photos, SparsePoints(torch.cat(xyz).float(), torch.cat(rgb), torch.cat(normals).float())
 
 
 def started(world, losses, noise=0.0, **settings):

@@ -15,8 +15,8 @@ from .test_checkpoint import small_files
 @pytest.fixture
 def path(begin, tmp_path, monkeypatch):
     """A state of 40 points after two steps in a file, to be read 7 points at a time."""
-    monkeypatch.setattr(streaming, "ROWS", 7)
-    monkeypatch.setattr(streaming, "BYTES", 100)
+    monkeypatch.setattr(streaming, "PIECE_POINTS", 7)
+    monkeypatch.setattr(streaming, "CHUNK_BYTES", 100)
     trainer, state = begin(Stage(steps=9))
     for _ in range(2):
         trainer.step(state)
@@ -35,7 +35,7 @@ def test_pieces_are_the_whole(path):
     found = whole(stored)
     assert found.keys() == true.points.params.keys()
     assert all(torch.equal(found[name], value) for name, value in true.points.params.items())
-    assert all(getattr(stored.state, name) == getattr(true, name) for name in checkpoint.SCALARS)
+    assert all(getattr(stored.state, name) == getattr(true, name) for name in checkpoint.SCALAR_FIELDS)
     assert torch.equal(stored.state.order.queue, true.order.queue)
     assert torch.equal(stored.state.generator.get_state(), true.generator.get_state())
 

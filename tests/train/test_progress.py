@@ -4,16 +4,16 @@ import torch
 from rich.console import Console
 
 from surfkit.raster.api import Maps
-from surfkit.train.progress import Display, Mean, clock, outer
-from surfkit.train.trainer import Done
+from surfkit.train.progress import RunningMean, TrainingDisplay, clock, outer
+from surfkit.train.trainer import CompletedStep
 
 
 class Shown:
     photo = torch.zeros(3, 4, 4)
 
 
-def done(index: int) -> Done:
-    return Done(index, {"l1": 0.25, "ssim": 0.25}, 12_345, Maps(color=torch.full((3, 4, 4), 0.1)), Shown())
+def done(index: int) -> CompletedStep:
+    return CompletedStep(index, {"l1": 0.25, "ssim": 0.25}, 12_345, Maps(color=torch.full((3, 4, 4), 0.1)), Shown())
 
 
 def test_clock():
@@ -21,7 +21,7 @@ def test_clock():
 
 
 def test_mean_forgets_slowly():
-    mean = Mean()
+    mean = RunningMean()
     mean.add(4)
     mean.add(2)
     assert mean.value == 3
@@ -32,7 +32,7 @@ def test_mean_forgets_slowly():
 
 def test_without_a_terminal_lines_are_plain_and_the_last_step_is_shown():
     out = io.StringIO()
-    with Display("pretrain", 20, Console(file=out, width=40)) as display:
+    with TrainingDisplay("pretrain", 20, Console(file=out, width=40)) as display:
         for index in range(1, 21):
             display.show(done(index))
     lines = out.getvalue().splitlines()
@@ -44,7 +44,7 @@ def test_without_a_terminal_lines_are_plain_and_the_last_step_is_shown():
 
 def test_on_a_terminal_there_is_a_bar():
     out = io.StringIO()
-    with Display("pretrain", 3, Console(file=out, width=160, force_terminal=True)) as display:
+    with TrainingDisplay("pretrain", 3, Console(file=out, width=160, force_terminal=True)) as display:
         for index in range(1, 4):
             display.show(done(index))
     assert "━" in out.getvalue() and "step 3/3" in out.getvalue()
@@ -52,7 +52,7 @@ def test_on_a_terminal_there_is_a_bar():
 
 def test_within_another_display_the_numbers_go_there():
     out, drawn = io.StringIO(), []
-    with outer(lambda *numbers: drawn.append(numbers)), Display("pretrain", 3, Console(file=out)) as display:
+    with outer(lambda *numbers: drawn.append(numbers)), TrainingDisplay("pretrain", 3, Console(file=out)) as display:
         for index in range(1, 4):
             display.show(done(index))
     assert out.getvalue() == ""

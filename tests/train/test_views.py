@@ -1,11 +1,11 @@
 import torch
 
-from surfkit.train.views import Order, ViewContributions
+from surfkit.train.views import ViewContributions, ViewOrder
 
 
 def test_every_view_is_shown_once_in_each_round_in_an_order_of_the_generator():
     def shown(seed, count=30):
-        order, generator = Order(10), torch.Generator().manual_seed(seed)
+        order, generator = ViewOrder(10), torch.Generator().manual_seed(seed)
         return [order.next(generator) for _ in range(count)]
 
     rounds = torch.tensor(shown(0)).view(3, 10)
@@ -15,9 +15,9 @@ def test_every_view_is_shown_once_in_each_round_in_an_order_of_the_generator():
 
 
 def test_an_order_goes_on_where_it_was_left():
-    whole, generator = Order(5), torch.Generator().manual_seed(0)
+    whole, generator = ViewOrder(5), torch.Generator().manual_seed(0)
     first = [whole.next(generator) for _ in range(7)]
-    copy, state = Order(whole.count, whole.queue.clone(), whole.at), generator.get_state()
+    copy, state = ViewOrder(whole.count, whole.queue.clone(), whole.at), generator.get_state()
     rest = [whole.next(generator) for _ in range(9)]
     generator.set_state(state)
     assert [copy.next(generator) for _ in range(9)] == rest and len(first) == 7

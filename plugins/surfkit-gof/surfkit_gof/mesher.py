@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surfkit.mesh.field import least_opacity
-from surfkit.mesh.tetra import FINEST, Edges, pivots
+from surfkit.mesh.tetra import MAX_BISECTIONS, SurfaceBracket, pivots
 from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput
 
 
@@ -51,10 +51,10 @@ class OpacityField(Mesher):
             raise BadInput(f"mesh: gof.reach is {self.reach} and thickness {self.thickness}; both must be positive")
         if not (0 < self.level < 1 and 0 <= self.faint < 1):
             raise BadInput(f"mesh: gof.level is {self.level} and faint {self.faint}; both must lie between 0 and 1")
-        if not 0 <= self.bisections <= FINEST or self.min_views < 1 or self.longest < 0:
+        if not 0 <= self.bisections <= MAX_BISECTIONS or self.min_views < 1 or self.longest < 0:
             raise BadInput(
                 f"mesh: gof.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
-                f"give 0 to {FINEST}, 1 or more, 0 or more"
+                f"give 0 to {MAX_BISECTIONS}, 1 or more, 0 or more"
             )
 
     def mesh(self, subject: MeshInput) -> Mesh:
@@ -71,7 +71,7 @@ class OpacityField(Mesher):
         def hidden(places: Tensor, what: str) -> Tensor:
             return least_opacity(subject, places, what, self.level)[0] > self.level
 
-        edges = Edges(points, half.amax(1)[rows], known.numpy(), inside.numpy())
+        edges = SurfaceBracket(points, half.amax(1)[rows], known.numpy(), inside.numpy())
         mesh = edges.surface(subject, self.bisections, self.longest, hidden)
         return replace(mesh, facts={"points": len(points), "unseen_points": int(unseen.sum())})
 

@@ -17,7 +17,7 @@ from surfkit.plugin import Mesher, components, rescale
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 from surfkit.study.ablation import build, offered_tables
 from surfkit.train.trainer import Trainer
 
@@ -57,7 +57,7 @@ def test_a_short_training_with_the_recipe():
         views.append(View(f"{x}.png", Camera(pose, 40.0, 40.0, 16.0, 12.0, 32, 24), Path(f"{x}.png")))
     y, x = torch.meshgrid(torch.arange(24), torch.arange(32), indexing="ij")
     photo = (127 + 120 * torch.stack([torch.sin(x / 3), torch.sin(y / 4), torch.cos((x + y) / 5)])).to(torch.uint8)
-    cloud = Cloud(0.6 * (torch.rand(80, 3, generator=draw) - 0.5), torch.full((80, 3), 127, dtype=torch.uint8))
+    cloud = SparsePoints(0.6 * (torch.rand(80, 3, generator=draw) - 0.5), torch.full((80, 3), 127, dtype=torch.uint8))
     stage = rescale(GOF.pretrain, 160 / 30_000)
     densify = MatchedADC(replace(stage.densify.adc, start=10, until=120, every=20, reset_every=1_000))
     rates = {"means": LearningRate(1.6e-4)}

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from surfkit.plugin import BadInput, Camera, DepthEstimator, DepthInput, Observations, Seen, View
+from surfkit.plugin import BadInput, Camera, DepthEstimator, DepthInput, Observations, Observations2D, View
 
 SIDES = ("left", "right")
 """Names of the two views of a pair."""
@@ -82,7 +82,7 @@ class Pair:
             at = view.camera.project(xyz)[:, :2] / torch.tensor([view.camera.width, view.camera.height])
             inside = ((at > 0) & (at < 1)).all(1)
             rows = inside.nonzero()[:, 0]
-            seen[view.name] = Seen(rows.numpy(), at[rows].numpy())
+            seen[view.name] = Observations2D(rows.numpy(), at[rows].numpy())
         known = Observations(xyz.numpy(), np.zeros(len(xyz)), seen)
         work = folder / "work"
         work.mkdir()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.mesh.fusion import TILES
+from surfkit.mesh.fusion import TILES_PATTERN
 from surfkit.mesh.stereo import points
 from surfkit.plugin import (
     TSDF,
@@ -86,7 +86,7 @@ class RenderedStereo(Mesher):
         if not subject.views:
             raise BadInput("nothing to mesh: there are no views")
         self.estimator.refuse_unfit(subject.views)
-        with tempfile.TemporaryDirectory(dir=subject.scratch, prefix=TILES.rstrip("*")) as name:
+        with tempfile.TemporaryDirectory(dir=subject.scratch, prefix=TILES_PATTERN.rstrip("*")) as name:
             folder = Path(name)
             kept = [self._stored(subject, at, folder) for at in range(len(subject.views))]
             if not any(kept):

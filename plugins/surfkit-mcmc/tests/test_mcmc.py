@@ -19,7 +19,7 @@ from surfkit.primitives.columns import RATES
 from surfkit.primitives.edit import apply
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 from surfkit.testing import check, check_policy
 from surfkit.train.trainer import Trainer
 
@@ -40,7 +40,7 @@ def offered():
 def crowd(primitive=None, dead: int = 60) -> tuple[Points, Step]:
     """Points of which the first are dead, and a step at which they move."""
     primitive, draw = primitive or Gaussian3D(sh_degree=1), torch.Generator().manual_seed(0)
-    cloud = Cloud(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
+    cloud = SparsePoints(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
     params = primitive.init(cloud, draw)
     params["opacities"] = torch.linspace(-2, 3, N)
     params["opacities"][:dead] = -8
@@ -180,7 +180,7 @@ def test_a_short_training_with_the_recipe():
         views.append(View(f"{x}.png", Camera(pose, 40.0, 40.0, 16.0, 12.0, 32, 24), Path(f"{x}.png")))
     y, x = torch.meshgrid(torch.arange(24), torch.arange(32), indexing="ij")
     photo = (127 + 120 * torch.stack([torch.sin(x / 3), torch.sin(y / 4), torch.cos((x + y) / 5)])).to(torch.uint8)
-    cloud = Cloud(0.6 * (torch.rand(50, 3, generator=draw) - 0.5), torch.full((50, 3), 127, dtype=torch.uint8))
+    cloud = SparsePoints(0.6 * (torch.rand(50, 3, generator=draw) - 0.5), torch.full((50, 3), 127, dtype=torch.uint8))
     moves = Relocation(cap=120, start=10, until=150, every=10, growth=0.2)
     rates = RATES | {"means": LearningRate(1.6e-4)}
     stage = replace(recipe.pretrain, steps=160, densify=moves, rates=rates, sh_every=1_000)

@@ -12,7 +12,7 @@ from surfkit_neus.losses import color_loss, curvature_loss, depth_loss, eikonal_
 from surfkit_neus.sampling import beyond_samples, even_samples, importance_samples, surface_samples
 from surfkit_neus.weights import section_alphas, section_ends, weights_of
 
-from surfkit.plugin import BadInput, Camera, Cloud, Frame, Scene, View
+from surfkit.plugin import BadInput, Camera, Frame, Scene, SparsePoints, View
 
 SMALL = Grid(levels=4, features=3, table_bits=9, coarsest=3, finest=24)
 
@@ -219,7 +219,7 @@ def survey(points: int = 500, cameras=((0, 0, 1), (0.5, 0, 1.2), (0, 0.5, 1.1)))
         centre = turn @ (torch.tensor(place, dtype=torch.float64) + torch.tensor([2.0, 1.0, 1.0]))
         pose[:3, 3] = -centre
         views.append(View(f"{at}", Camera(pose, 40.0, 40.0, 16.0, 12.0, 32, 24), None))
-    cloud = Cloud((xyz.double() @ turn.T).float(), torch.zeros(points, 3, dtype=torch.uint8))
+    cloud = SparsePoints((xyz.double() @ turn.T).float(), torch.zeros(points, 3, dtype=torch.uint8))
     return Scene("slope", tuple(views), (), cloud, Frame.of_positions(xyz.numpy()))
 
 
@@ -253,7 +253,7 @@ def test_a_scene_without_a_size_is_refused():
     with pytest.raises(BadInput, match="9 sparse points"):
         scene_box(survey(9), 0.1)
     scene = survey()
-    flat = Scene("dot", scene.train, (), Cloud(torch.zeros(50, 3), scene.cloud.rgb[:50]), scene.frame)
+    flat = Scene("dot", scene.train, (), SparsePoints(torch.zeros(50, 3), scene.cloud.rgb[:50]), scene.frame)
     with pytest.raises(BadInput, match="lie in one place"):
         scene_box(flat, 0.1)
 

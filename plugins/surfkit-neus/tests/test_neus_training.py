@@ -21,7 +21,18 @@ from surfkit.cli import main
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import DepthPrior
-from surfkit.plugin import BadInput, Camera, Cloud, Frame, MethodInput, Scene, StepDone, View, components, hookimpl
+from surfkit.plugin import (
+    BadInput,
+    Camera,
+    Frame,
+    MethodInput,
+    Scene,
+    SparsePoints,
+    StepDone,
+    View,
+    components,
+    hookimpl,
+)
 from surfkit.raster.select import select
 from surfkit.runs.methods.base import Method
 from surfkit.study.ablation import build, offered_tables
@@ -90,7 +101,7 @@ def ball(folder: Path, side: int = 24, masks: bool = False, priors: bool = False
         return DepthPrior(inverse, (z > 0).float(), 0.5)
 
     xyz = RADIUS * torch.nn.functional.normalize(torch.randn(400, 3, generator=draw), dim=1)
-    scene = Scene("ball", views, (), Cloud(xyz, torch.zeros(400, 3, dtype=torch.uint8)), Frame(np.zeros(3), 1.0))
+    scene = Scene("ball", views, (), SparsePoints(xyz, torch.zeros(400, 3, dtype=torch.uint8)), Frame(np.zeros(3), 1.0))
     return MethodInput(
         scene=scene,
         photo=photo,
@@ -253,7 +264,7 @@ def test_data_that_do_not_fit_are_refused(tmp_path):
         replace(method, prior=1.0).refuse_unfit(given)
     with pytest.raises(BadInput, match="lower method.rays"):
         method.refuse_unfit(replace(given, budget_bytes=1000))
-    few = replace(given.scene, cloud=Cloud(torch.zeros(3, 3), torch.zeros(3, 3, dtype=torch.uint8)))
+    few = replace(given.scene, cloud=SparsePoints(torch.zeros(3, 3), torch.zeros(3, 3, dtype=torch.uint8)))
     with pytest.raises(BadInput, match="3 sparse points"):
         method.refuse_unfit(replace(given, scene=few))
     assert not method.needs_prior and replace(method, prior=1.0).needs_prior

@@ -14,7 +14,6 @@ from surfkit.plugin import (
     SIGMOID,
     BadInput,
     Camera,
-    Cloud,
     Column,
     Columns,
     DerivedRender,
@@ -22,6 +21,7 @@ from surfkit.plugin import (
     Primitive,
     Rasterizer,
     Render,
+    SparsePoints,
     Splats,
     seeds,
 )
@@ -81,7 +81,7 @@ class Anchors(Primitive):
             **network_columns(self.feature, self.hidden, self.offsets),
         }
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """One anchor of level 0 for each cloud point, with a feature and offsets of 0."""
         columns, count = self.columns(), len(cloud.xyz)
         begun = seeds({name: columns[name] for name in ("means", "scales")}, cloud)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.plugin import BadInput, Cloud, InitialModel, Primitive, Start, StartInput
+from surfkit.plugin import BadInput, InitialModel, Primitive, SparsePoints, Start, StartInput
 from surfkit.primitives.init import gaps
 from surfkit_octree.anchors import Anchors
 from surfkit_octree.levels import MOST_LEVELS, TABLE, LevelTable, centres, level_count, view_distances, voxels
@@ -57,7 +57,7 @@ class AnchorVoxels(Start):
         middle = self.voxel or float(gaps(xyz).median())
         return LevelTable(farthest, count, 0, middle * self.fork ** (count // 2), self.fork)
 
-    def anchors(self, known: StartInput) -> tuple[Cloud, Tensor, LevelTable]:
+    def anchors(self, known: StartInput) -> tuple[SparsePoints, Tensor, LevelTable]:
         """The places of the anchors, their (N,) int64 levels, and the table of levels.
 
         Anchors of a level that no training camera would draw are left out.
@@ -78,9 +78,9 @@ class AnchorVoxels(Start):
             colours.append(rgb[first[drawn]])
             levels.append(of[drawn])
         level = torch.cat(levels)
-        return Cloud(torch.cat(places), torch.cat(colours), size=table.side(level)), level, table
+        return SparsePoints(torch.cat(places), torch.cat(colours), size=table.side(level)), level, table
 
-    def cloud(self, known: StartInput) -> Cloud:
+    def cloud(self, known: StartInput) -> SparsePoints:
         """See `Start.cloud`."""
         return self.anchors(known)[0]
 

@@ -12,7 +12,7 @@ from surfkit_octree.growth import GRAD, OPACITY, SEEN, VIEWS
 from surfkit_octree.levels import TABLE, LevelTable, census, is_in_view, level_count, view_distances
 
 from surfkit.core.registry import plugins
-from surfkit.plugin import BadInput, Camera, Cloud, Densify, Derived, Maps, Points, Splats, Step, components
+from surfkit.plugin import BadInput, Camera, Densify, Derived, Maps, Points, SparsePoints, Splats, Step, components
 from surfkit.raster.select import select
 from surfkit.testing import check, check_component, check_densify, check_policy, check_primitive
 from surfkit.testing.inputs import KnownViews, start_input
@@ -41,7 +41,9 @@ def model(count=8, primitive=SMALL, seed=0):
     """Random anchors around 0, with features, offsets and opacities that are not those of the beginning."""
     draw = torch.Generator().manual_seed(seed)
     xyz = torch.rand(count, 3, generator=draw) - 0.5
-    params = primitive.init(Cloud(xyz, torch.zeros(count, 3, dtype=torch.uint8), size=torch.full((count,), 0.1)), draw)
+    params = primitive.init(
+        SparsePoints(xyz, torch.zeros(count, 3, dtype=torch.uint8), size=torch.full((count,), 0.1)), draw
+    )
     params["feature"] = torch.randn(params["feature"].shape, generator=draw)
     params["offsets"] = torch.randn(params["offsets"].shape, generator=draw)
     params["scales"] += 0.3 * torch.randn(params["scales"].shape, generator=draw)

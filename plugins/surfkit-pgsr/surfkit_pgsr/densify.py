@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from surfkit.densify.adc import GRAD, SEEN
+from surfkit.densify.adc import GRAD_STAT, SEEN_STAT
 from surfkit.plugin import ADC, BadInput, CountCap, Densify, Edit, Points, Prune, Step, StepCount, Steps, admitted
 
 ABSOLUTE, RADIUS = "two-threshold/absolute", "two-threshold/radius"
@@ -78,8 +78,11 @@ class TwoThresholdADC(Densify):
     def wants(self, points: Points) -> tuple[Tensor, Tensor]:
         """(N,) how far a point is above the threshold of the signed gradient, 1 or more, or 0 where it is below; and
         the same of the absolute one, of points that only that one chooses."""
-        seen = points.stat(SEEN).clamp_min(1)
-        signed, absolute = points.stat(GRAD) / seen / self.adc.threshold, points.stat(ABSOLUTE) / seen / self.absolute
+        seen = points.stat(SEEN_STAT).clamp_min(1)
+        signed, absolute = (
+            points.stat(GRAD_STAT) / seen / self.adc.threshold,
+            points.stat(ABSOLUTE) / seen / self.absolute,
+        )
         signed = signed * (signed >= 1)
         chosen = (absolute >= 1) & (points.stat(RADIUS) > self.radius_px) & (signed == 0)
         absolute = absolute * chosen

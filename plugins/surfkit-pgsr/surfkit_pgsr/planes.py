@@ -11,7 +11,6 @@ from torch import Tensor
 from surfkit.plugin import (
     SH_C0,
     Camera,
-    Cloud,
     Column,
     Columns,
     DerivedRender,
@@ -21,6 +20,7 @@ from surfkit.plugin import (
     Primitive,
     Rasterizer,
     Render,
+    SparsePoints,
     Splats,
     rotated,
 )
@@ -53,7 +53,7 @@ class PlanarGaussian(Primitive):
         """Those of ellipsoids."""
         return self._ellipsoids.columns()
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """Balls."""
         return self._ellipsoids.init(cloud, generator)
 

@@ -20,11 +20,11 @@ from surfkit.densify import ADC, Elongation, LossGradient
 from surfkit.plugin import (
     BadInput,
     Camera,
-    Cloud,
     Contribution,
     Maps,
     Points,
     Primitive,
+    SparsePoints,
     Step,
     Target,
     View,
@@ -148,7 +148,7 @@ def test_exposure_is_one_gain_and_offset_and_is_folded_as_their_mean():
 def crowd(seed=0) -> tuple[Points, Step]:
     """Points of all sizes and gradients, at a step at which they are densified."""
     draw = torch.Generator().manual_seed(seed)
-    cloud = Cloud(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
+    cloud = SparsePoints(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
     params = Surfel2D().init(cloud, draw)
     params["scales"] = torch.log(10 ** (-1.5 - 2.5 * torch.rand(N, 2, generator=draw)))
     step = Step(
@@ -276,7 +276,7 @@ def test_a_short_training_finds_the_wall_and_drops_what_one_view_sees():
     xy = torch.rand(250, 2, generator=draw) * torch.tensor([1.3, 0.9]) - torch.tensor([0.65, 0.45])
     depth = 1 + 0.4 * xy[:, :1] + 0.03 * torch.randn(250, 1, generator=draw)
     alone = torch.tensor([[-1.4, 0.0, 2.7]])  # beyond the rim of all views but one
-    cloud = Cloud(torch.cat([torch.cat([xy, depth], 1), alone]), torch.full((251, 3), 127, dtype=torch.uint8))
+    cloud = SparsePoints(torch.cat([torch.cat([xy, depth], 1), alone]), torch.full((251, 3), 127, dtype=torch.uint8))
     params = recipe.primitive.init(cloud, draw)
     params["scales"][-1] = math.log(0.02)
     began = {name: value.clone() for name, value in params.items()}

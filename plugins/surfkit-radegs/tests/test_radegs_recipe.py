@@ -18,7 +18,7 @@ from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement_reference
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, View
+from surfkit.scene.scene import SparsePoints, View
 from surfkit.study.ablation import build, offered_tables
 from surfkit.train.trainer import Trainer
 
@@ -78,7 +78,7 @@ def test_a_short_training_with_the_recipe():
     views = [seen_from(x) for x in (-0.1, 0.1)]
     y, x = torch.meshgrid(torch.arange(24), torch.arange(32), indexing="ij")
     photo = (127 + 120 * torch.stack([torch.sin(x / 3), torch.sin(y / 4), torch.cos((x + y) / 5)])).to(torch.uint8)
-    cloud = Cloud(0.6 * (torch.rand(80, 3, generator=draw) - 0.5), torch.full((80, 3), 127, dtype=torch.uint8))
+    cloud = SparsePoints(0.6 * (torch.rand(80, 3, generator=draw) - 0.5), torch.full((80, 3), 127, dtype=torch.uint8))
     stage = rescale(RADEGS.pretrain, 160 / 30_000)
     adc = replace(stage.densify.adc, start=10, until=120, every=20, reset_every=1_000)
     densify = replace(stage.densify, adc=adc)

@@ -13,7 +13,6 @@ from torch import Tensor
 from surfkit.plugin import (
     SH_C0,
     BadInput,
-    Cloud,
     Column,
     Columns,
     Flat3D,
@@ -23,6 +22,7 @@ from surfkit.plugin import (
     MeshInput,
     Primitive,
     Regularizer,
+    SparsePoints,
     Splats,
     Surfel2D,
     facing,
@@ -64,7 +64,7 @@ class MeshBound(Primitive):
             "pairs": Column((None, 2), fixed, shared=True),
         }
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """A triangle of its own for each point, which faces along its normal, or any way when it has none."""
         names = ("opacities", "sh0", "sh_rest", "scales")
         begun = seeds({name: column for name, column in self.columns().items() if name in names}, cloud)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from surfkit.mesh.poisson import ENOUGH, reconstructed, require_open3d, seen_pixels
+from surfkit.mesh.poisson import MIN_ORIENTED_POINTS, reconstructed, require_open3d, seen_pixels
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput
 from surfkit_sugar.density import Ellipsoids, density, gathered, turned, whitened
@@ -61,10 +61,10 @@ class LevelSetPoisson(Mesher):
                 f"mesh: sugar has level {self.level:g}, samples {self.samples}, reach {self.reach:g} and neighbours "
                 f"{self.neighbours}; give a level between 0 and 1, 2 or more, above 0, and 1 or more"
             )
-        if self.points < ENOUGH or not 0 <= self.thin < 1 or self.triangles < 0:
+        if self.points < MIN_ORIENTED_POINTS or not 0 <= self.thin < 1 or self.triangles < 0:
             raise BadInput(
                 f"mesh: sugar has points {self.points}, thin {self.thin:g} and triangles {self.triangles}; give "
-                f"{ENOUGH} or more, 0 or more below 1, and 0 or more"
+                f"{MIN_ORIENTED_POINTS} or more, 0 or more below 1, and 0 or more"
             )
 
     def ready(self) -> None:
@@ -84,7 +84,7 @@ class LevelSetPoisson(Mesher):
                 points, normals, met = field.crossings(pixels.points[rows], pixels.rays[rows])
                 found.append((points, normals, pixels.colors[rows][met]))
         points, normals, colors = (torch.cat(part) for part in zip(*found, strict=True)) if found else [()] * 3
-        if len(points) < ENOUGH:
+        if len(points) < MIN_ORIENTED_POINTS:
             raise BadInput(
                 f"mesh: the density crosses {self.level:g} before {len(points)} of {looked:,} pixels that have a depth "
                 f"in {len(subject.views)} views; lower --mesh.level, raise --mesh.reach, or train longer"

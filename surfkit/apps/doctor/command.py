@@ -14,10 +14,10 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from surfkit.apps.doctor.estimate import Estimate, duration, likely_range
+from surfkit.apps.doctor.estimate import ResourceEstimate, duration, likely_range
 from surfkit.apps.doctor.examine import Diagnosis, Told, examine
-from surfkit.apps.doctor.finding import LEVELS, Finding
-from surfkit.apps.doctor.forecast import Plan, forecast
+from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding
+from surfkit.apps.doctor.forecast import ProbePlan, forecast
 from surfkit.apps.doctor.machine import Machine, machine
 from surfkit.apps.doctor.usual_steps import with_usual_steps
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
@@ -26,17 +26,17 @@ from surfkit.core.check import BadInput, printable
 from surfkit.core.codec import dump
 from surfkit.core.memory import size
 from surfkit.core.registry import name_of
-from surfkit.io.datasets.data import Reading
+from surfkit.io.datasets.data import ReadSettings
 from surfkit.raster.select import Device
 from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe
 
-MOST_PROBED, MOST_POINTS = 10_000, 2**31 - 1
+MAX_PROBED_STEPS, MAX_POINT_COUNT = 10_000, 2**31 - 1
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
 @dataclass(frozen=True)
-class Doctor:
+class DoctorCommand:
     """Check a data set before training: its contents, all errors in it, and the memory, disk and time of a run.
 
     Without a data set, tell what surfkit runs on, for a report of a bug: versions, devices, compiled kernels.
@@ -67,7 +67,7 @@ class Doctor:
     steps: int | None = None
     """Optimisation steps of the run; every schedule of the recipe is scaled by the same factor."""
 
-    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    reading: Annotated[ReadSettings, tyro.conf.arg(name="")] = ReadSettings()
     """How the data set is read."""
 
     cache: str = "auto"
@@ -86,10 +86,10 @@ class Doctor:
             if words := [word for word in ARGV.get() if not word.startswith(known)]:
                 raise BadInput(f"{words[0]} is about a data set; name its folder: surfkit doctor DATA")
         object.__setattr__(self, "recipe", settled(self.recipe))
-        if not 0 <= self.probe <= MOST_PROBED:
-            raise BadInput(f"--probe {self.probe}: give 0 (no estimate) to {MOST_PROBED} steps")
-        if self.points is not None and not 1 <= self.points <= MOST_POINTS:
-            raise BadInput(f"--points {self.points}: give 1 to {MOST_POINTS}")
+        if not 0 <= self.probe <= MAX_PROBED_STEPS:
+            raise BadInput(f"--probe {self.probe}: give 0 (no estimate) to {MAX_PROBED_STEPS} steps")
+        if self.points is not None and not 1 <= self.points <= MAX_POINT_COUNT:
+            raise BadInput(f"--points {self.points}: give 1 to {MAX_POINT_COUNT}")
 
     def run(self) -> int:
         """Check, and print the findings."""
@@ -112,9 +112,9 @@ class Doctor:
                 text = f"there is no estimate for method:{name_of(recipe.method)}: it does not optimise splats"
                 diagnosis = replace(diagnosis, findings=(*diagnosis.findings, Finding("note", "forecast", text)))
             elif diagnosis.sound and self.probe:
-                plan = Plan(self.probe, self.points, self.cache, self.device, self.out)
+                plan = ProbePlan(self.probe, self.points, self.cache, self.device, self.out)
                 estimate, findings = forecast(data, recipe, examined, plan, report)
-                findings = tuple(sorted((*diagnosis.findings, *findings), key=lambda f: LEVELS.index(f.level)))
+                findings = tuple(sorted((*diagnosis.findings, *findings), key=lambda f: FINDING_LEVELS.index(f.level)))
                 diagnosis = replace(diagnosis, findings=findings, estimate=estimate)
         if self.json:
             print(as_json(diagnosis))
@@ -167,7 +167,7 @@ def show(diagnosis: Diagnosis, estimate_wanted: bool) -> None:
     console.print(verdict(diagnosis, estimate_wanted), style="bold")
 
 
-def rows(found: Estimate) -> list[tuple[str, str]]:
+def rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     """The rows of the table of the estimate."""
     room = found.room
     steps = ", ".join(f"{1000 * seconds:.0f}" for seconds in found.step_seconds)
@@ -189,7 +189,7 @@ def rows(found: Estimate) -> list[tuple[str, str]]:
     return table
 
 
-def _gpu_rows(found: Estimate) -> list[tuple[str, str]]:
+def _gpu_rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     """Of the memory of the GPU, if there is one."""
     if (gpu := found.gpu) is None:
         return []
@@ -223,8 +223,10 @@ def machine_rows(found: Machine) -> list[tuple[str, str]]:
 
 def verdict(diagnosis: Diagnosis, estimate_wanted: bool) -> str:
     """The last line."""
-    counts = [sum(finding.level == level for finding in diagnosis.findings) for level in LEVELS]
-    words = [f"{count} {level}{'s' * (count != 1)}" for level, count in zip(LEVELS, counts, strict=True) if count]
+    counts = [sum(finding.level == level for finding in diagnosis.findings) for level in FINDING_LEVELS]
+    words = [
+        f"{count} {level}{'s' * (count != 1)}" for level, count in zip(FINDING_LEVELS, counts, strict=True) if count
+    ]
     if not diagnosis.sound:
         later = (
             "; the estimate comes when the errors are put right"
@@ -235,4 +237,4 @@ def verdict(diagnosis: Diagnosis, estimate_wanted: bool) -> str:
     return f"ready to train{': ' if words else ''}{', '.join(words)}"
 
 
-COMMAND = Doctor
+COMMAND = DoctorCommand

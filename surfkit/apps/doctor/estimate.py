@@ -8,27 +8,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.apps.doctor.finding import Finding
-from surfkit.apps.doctor.growth import SPREAD, Growth
-from surfkit.apps.doctor.probe import Part, Probed
+from surfkit.apps.doctor.growth import FORECAST_SPREAD_FACTOR, Growth
+from surfkit.apps.doctor.probe import ProbeResult, ProbeSegment
 from surfkit.core.memory import size
 from surfkit.train.data_cache import GPU_SHARE
 
 EVENT_BYTES = 260
 """A line of events.jsonl."""
-LONG_S = 48 * 3600.0
+LONG_RUN_S = 48 * 3600.0
 """A run that takes longer is worth a warning."""
 FIRST_LOOK_S = 2 * 3600.0
 """Before a run of recipe:surface that takes longer, a first look is worth its minutes."""
-MARGIN = 0.9
+USABLE_SHARE = 0.9
 """Share of what is free that advice counts on."""
-LEAST_CACHE = 200e6
+MIN_CACHE_BYTES = 200e6
 """A cache that is large enough to read ahead."""
 COUNT_CAP = "pretrain.densify.filters.0:count-cap --pretrain.densify.filters.0.points"
 """What limits the number of points, before that number."""
 
 
 @dataclass(frozen=True)
-class Load:
+class FixedCosts:
     """What of a run does not depend on its points.
 
     Attributes:
@@ -61,7 +61,7 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Room:
+class MachineLimits:
     """What the machine has.
 
     Attributes:
@@ -93,7 +93,7 @@ class GpuEstimate:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ResourceEstimate:
     """What a whole run will take.
 
     Attributes:
@@ -121,12 +121,14 @@ class Estimate:
     point_bytes: float
     run_bytes: int
     data_bytes: int
-    room: Room
+    room: MachineLimits
     probe_seconds: float = 0.0
     gpu: GpuEstimate | None = None
 
 
-def estimate(load: Load, parts: Sequence[Part], rising: Growth, probed: Probed, room: Room) -> Estimate:
+def estimate(
+    load: FixedCosts, parts: Sequence[ProbeSegment], rising: Growth, probed: ProbeResult, room: MachineLimits
+) -> ResourceEstimate:
     """What a run will take, of which all parts were measured.
 
     Args:
@@ -156,7 +158,7 @@ def estimate(load: Load, parts: Sequence[Part], rising: Growth, probed: Probed, 
     seconds += saves + load.held_out * (probed.written.draw_seconds + probed.started.photo_seconds)
     on_disk = rising.last * (2 * probed.written.checkpoint_bytes + probed.written.cloud_bytes)
     on_disk += load.held_out * probed.written.picture_bytes + load.steps * EVENT_BYTES
-    return Estimate(
+    return ResourceEstimate(
         points=rising.last,
         points_known=rising.known,
         seconds=float(seconds),
@@ -171,7 +173,7 @@ def estimate(load: Load, parts: Sequence[Part], rising: Growth, probed: Probed, 
     )
 
 
-def _on_gpu(load: Load, rising: Growth, probed: Probed) -> GpuEstimate:
+def _on_gpu(load: FixedCosts, rising: Growth, probed: ProbeResult) -> GpuEstimate:
     counts, peaks = (
         np.array(each, float) for each in zip(*((t.points, t.gpu_bytes) for t in probed.taken), strict=True)
     )
@@ -187,12 +189,12 @@ def slope(x: np.ndarray, y: np.ndarray) -> float:
     return float((centred * y).sum() / (centred**2).sum()) if np.ptp(x) > 0 else 0.0
 
 
-def advice(found: Estimate) -> list[Finding]:
+def advice(found: ResourceEstimate) -> list[Finding]:
     """What to lower where a run will not fit, or take days."""
     return [*_memory(found), *_gpu_memory(found), *_disk(found), *_time(found)]
 
 
-def first_look(found: Estimate) -> list[Finding]:
+def first_look(found: ResourceEstimate) -> list[Finding]:
     """The recipe for a first look, where one that begins at stereo depth takes hours."""
     if found.seconds <= FIRST_LOOK_S:
         return []
@@ -200,9 +202,9 @@ def first_look(found: Estimate) -> list[Finding]:
     return [Finding("note", "first-look", text)]
 
 
-def _gpu_memory(found: Estimate) -> list[Finding]:
+def _gpu_memory(found: ResourceEstimate) -> list[Finding]:
     gpu = found.gpu
-    if gpu is None or (rest := gpu.memory_bytes - gpu.cache_bytes) <= (free := MARGIN * gpu.free_bytes):
+    if gpu is None or (rest := gpu.memory_bytes - gpu.cache_bytes) <= (free := USABLE_SHARE * gpu.free_bytes):
         return []
     likely = "" if found.points_known else f" with the {found.points:,} points that are likely"
     text = (
@@ -215,25 +217,25 @@ def _gpu_memory(found: Estimate) -> list[Finding]:
     return [Finding("warning", "gpu-memory", text)]
 
 
-def _memory(found: Estimate) -> list[Finding]:
-    free = MARGIN * found.room.memory_bytes
+def _memory(found: ResourceEstimate) -> list[Finding]:
+    free = USABLE_SHARE * found.room.memory_bytes
     if found.memory_bytes <= free:
         return []
     rest = found.memory_bytes - found.cache_bytes
     likely = "" if found.points_known else f" with the {found.points:,} points that are likely"
     text = f"the run will take about {size(found.memory_bytes)} of memory{likely}, and {size(free)} can be used: "
-    if found.cache_bytes and rest + LEAST_CACHE < free:
+    if found.cache_bytes and rest + MIN_CACHE_BYTES < free:
         text += f"use --cache {size(free - rest, 0).replace(' ', '')}, which is slower and gives the same result"
     else:
-        fewer = found.points - (rest + LEAST_CACHE - free) / max(found.point_bytes, 1)
+        fewer = found.points - (rest + MIN_CACHE_BYTES - free) / max(found.point_bytes, 1)
         text += "smaller photographs (--scale 2) need less"
         if fewer > 0.1 * found.points:
             text += f", and so do fewer points: {COUNT_CAP} {one_digit(fewer)}"
-        text += f" with --cache {size(LEAST_CACHE, 0).replace(' ', '')}"
+        text += f" with --cache {size(MIN_CACHE_BYTES, 0).replace(' ', '')}"
     return [Finding("warning", "memory", text)]
 
 
-def _disk(found: Estimate) -> list[Finding]:
+def _disk(found: ResourceEstimate) -> list[Finding]:
     where = [
         ("run-folder-disk", "the run folder", found.run_bytes, found.room.run_bytes),
         ("undistorted-disk", "undistorted photographs", found.data_bytes, found.room.data_bytes),
@@ -246,12 +248,12 @@ def _disk(found: Estimate) -> list[Finding]:
             "another disk (--out), or use smaller photographs (--scale 2)",
         )
         for what, name, need, free in where
-        if need > MARGIN * free
+        if need > USABLE_SHARE * free
     ]
 
 
-def _time(found: Estimate) -> list[Finding]:
-    if found.seconds <= LONG_S:
+def _time(found: ResourceEstimate) -> list[Finding]:
+    if found.seconds <= LONG_RUN_S:
         return []
     text = (
         f"the run will take about {duration(found.seconds)}: --steps shortens it with every schedule scaled along, and "
@@ -276,8 +278,9 @@ def one_digit(count: float) -> int:
     return max(1, int(count) // unit * unit)
 
 
-def likely_range(found: Estimate) -> str:
+def likely_range(found: ResourceEstimate) -> str:
     """The number of points in words."""
     if found.points_known:
         return f"{found.points:,}"
-    return f"{found.points:,} likely, {found.points / SPREAD:,.0f} to {found.points * SPREAD:,.0f} possible"
+    least, most = found.points / FORECAST_SPREAD_FACTOR, found.points * FORECAST_SPREAD_FACTOR
+    return f"{found.points:,} likely, {least:,.0f} to {most:,.0f} possible"

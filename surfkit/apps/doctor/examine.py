@@ -13,21 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.doctor.estimate import Estimate
+from surfkit.apps.doctor.estimate import ResourceEstimate
 from surfkit.apps.doctor.exposure import exposures
-from surfkit.apps.doctor.finding import LEVELS, Finding, of_each
+from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding, of_each
 from surfkit.apps.doctor.gather import Gathered, gather
 from surfkit.apps.doctor.geometry import Geometry, seen_by, survey
-from surfkit.apps.doctor.photographs import Photograph, Wanted, look_at
+from surfkit.apps.doctor.photographs import Photograph, PhotoToExamine, look_at
 from surfkit.apps.doctor.priors import priors
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
-from surfkit.io.datasets.capture import Shot
+from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import empty_masks
-from surfkit.io.datasets.panoramas import FACES, points_remedy, size_to_read, view_names, view_sizes
-from surfkit.io.datasets.panoramas import FOLDER as PANORAMAS
+from surfkit.io.datasets.panoramas import CUBE_FACES, points_remedy, size_to_read, view_names, view_sizes
+from surfkit.io.datasets.panoramas import PANORAMAS_FOLDER as PANORAMAS
 from surfkit.io.datasets.read import RANDOM_POINTS, check_size
 from surfkit.io.datasets.undistort import cache_folder, is_panorama, is_pinhole
 from surfkit.runs.recipe import Recipe
@@ -37,11 +37,11 @@ from surfkit.scene.photos import refuse_large
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-PLACES = 1_000
+BRIGHTNESS_POINTS = 1_000
 """Sparse points at which the brightness of photographs is compared."""
 UNEVEN_STOPS = 1.0
 """Spread of exposures, from the 10th to the 90th percentile, that a single colour of each point cannot explain."""
-INVERTED = 0.2
+MAX_INVERTED_SHARE = 0.2
 """A mask that keeps less is probably inverted, if most masks are so."""
 
 
@@ -61,7 +61,7 @@ class Diagnosis:
     found: dict[str, str] = field(default_factory=dict)
     will: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
-    estimate: Estimate | None = None
+    estimate: ResourceEstimate | None = None
 
     @property
     def sound(self) -> bool:
@@ -70,7 +70,7 @@ class Diagnosis:
 
 
 @dataclass(frozen=True)
-class Examined:
+class ExaminedData:
     """A diagnosis, and what an estimate goes on from.
 
     Attributes:
@@ -88,7 +88,7 @@ class Examined:
     read_peak_bytes: int
 
 
-def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None = None) -> Examined:
+def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None = None) -> ExaminedData:
     """Examine a data set; nothing is written.
 
     Args:
@@ -115,17 +115,17 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_exposure(gathered, known, recipe),
         *priors(data, gathered, recipe, quick),
     ]
-    findings.sort(key=lambda finding: LEVELS.index(finding.level))
+    findings.sort(key=lambda finding: FINDING_LEVELS.index(finding.level))
     found = _found(data, gathered, geometry, looks)
     diagnosis = Diagnosis(data.path, found, _will(data, gathered, known, recipe), tuple(findings))
-    return Examined(diagnosis, gathered, known, seconds, peak)
+    return ExaminedData(diagnosis, gathered, known, seconds, peak)
 
 
 def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None) -> dict[Path, Photograph]:
     """A look at every photograph that is there; at those without a pose only where nothing has one."""
-    compared = geometry.sample[:PLACES]
+    compared = geometry.sample[:BRIGHTNESS_POINTS]
     wanted = [
-        Wanted(
+        PhotoToExamine(
             shot.path,
             gathered.masks.get(shot.name),
             seen_by(shot, compared) if len(compared) and shot.name in geometry.sound else None,
@@ -134,7 +134,7 @@ def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None
         for shot in gathered.capture.shots
         if shot.path.is_file()
     ]
-    wanted = wanted or [Wanted(path) for path in gathered.loose]
+    wanted = wanted or [PhotoToExamine(path) for path in gathered.loose]
     looks = {}
     for one, found in zip(wanted, look_at(wanted, quick), strict=True):
         looks[one.path] = found
@@ -198,7 +198,7 @@ def _masks(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
     found = of_each("masks", {f"mask of {name}": text for name, text in faults.items()})
     kept = [look.kept for look in known.values() if look.kept is not None]
     empty = [name for name, look in known.items() if look.kept == 0]
-    if kept and np.median(kept) < INVERTED:
+    if kept and np.median(kept) < MAX_INVERTED_SHARE:
         text = (
             f"the masks keep {np.median(kept):.0%} of the pixels: black is ignored, so they are probably inverted; "
             "invert them, or name their folder with --masks"
@@ -300,7 +300,7 @@ def counted(values: Iterable[str], most: int = 4) -> str:
 
 def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> tuple[str, ...]:
     """What a run will do, in words."""
-    shots: Sequence[Shot] = gathered.capture.shots
+    shots: Sequence[RawImage] = gathered.capture.shots
     if not shots:
         return ()
     train, held = len(gathered.train), len(shots) - len(gathered.train)
@@ -317,7 +317,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     bent = sum(not is_pinhole(shot.camera) for shot in shots) - whole
     if whole:
         folder = place(data.path, PANORAMAS)
-        told.append(f"cut {whole} panoramas into {len(FACES)} views each, once, into {folder}")
+        told.append(f"cut {whole} panoramas into {len(CUBE_FACES)} views each, once, into {folder}")
     if bent:
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
     kinds = [(mask.alpha, mask.path == shot.path) for shot in shots if (mask := gathered.masks.get(shot.name))]

@@ -6,12 +6,12 @@ import warnings
 
 import numpy as np
 
-DARK = 0.005
+SHADOW_OFFSET = 0.005
 """Added to the linear luminance before its logarithm: noise of the shadows is no exposure."""
 WEIGHTS = (0.2126, 0.7152, 0.0722)
 """Of red, green and blue in the luminance of sRGB."""
-ROUNDS = 10
-ENOUGH = 10
+MEDIAN_ROUNDS = 10
+MIN_SHARED_PLACES = 10
 """Places that a photograph must share with others to be compared with them."""
 
 
@@ -28,7 +28,7 @@ def luminance(pixels: np.ndarray, places: np.ndarray) -> np.ndarray:
     x, y = (np.minimum((places[inside, axis] * size).astype(int), size - 1) for axis, size in ((0, width), (1, height)))
     value = pixels[y, x].astype(np.float32) / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    found[inside] = np.log2(linear @ np.array(WEIGHTS, np.float32) + DARK)
+    found[inside] = np.log2(linear @ np.array(WEIGHTS, np.float32) + SHADOW_OFFSET)
     return found
 
 
@@ -45,9 +45,9 @@ def exposures(brightness: np.ndarray) -> np.ndarray:
     stops = np.zeros(len(brightness), np.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # medians of nothing
-        for _ in range(ROUNDS):
+        for _ in range(MEDIAN_ROUNDS):
             typical = np.nanmedian(brightness - stops[:, None], axis=0)
             found = np.nanmedian(brightness - typical, axis=1)
             stops = np.nan_to_num(found - np.nanmedian(found))
-    known = np.isfinite(brightness).sum(1) >= ENOUGH
+    known = np.isfinite(brightness).sum(1) >= MIN_SHARED_PLACES
     return np.where(known, stops, np.nan)

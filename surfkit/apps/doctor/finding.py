@@ -11,10 +11,10 @@ from surfkit.core.check import BadInput, few
 
 Level = Literal["error", "warning", "note"]
 """An error stops training or loses photographs; a warning costs quality or hours; a note is to be known."""
-LEVELS: tuple[Level, ...] = ("error", "warning", "note")
+FINDING_LEVELS: tuple[Level, ...] = ("error", "warning", "note")
 _VARYING = re.compile(r"'[^']*'|\"[^\"]*\"|[^\s:]*/[^\s:]*|[^\s:]*\d[^\s:]*")
 """What differs between messages about one kind of fault: names, paths and numbers."""
-SHOWN = 3
+LISTED_NAMES = 3
 """Names of a group that are told in its line."""
 
 
@@ -66,7 +66,7 @@ def _told(level: Level, what: str, texts: Sequence[str]) -> Finding:
     names = tuple(dict.fromkeys(_own_part(text, texts) for text in texts)) if len(texts) > 1 else ()
     if len(texts) == 1:
         return Finding(level, what, texts[0])
-    others = ", ".join(names[1 : 1 + SHOWN]) + (", ..." if len(names) > 1 + SHOWN else "")
+    others = ", ".join(names[1 : 1 + LISTED_NAMES]) + (", ..." if len(names) > 1 + LISTED_NAMES else "")
     return Finding(level, what, f"{texts[0]} (and {len(texts) - 1} more like it: {others})", names)
 
 

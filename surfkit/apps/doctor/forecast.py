@@ -10,16 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from surfkit.apps.doctor.estimate import Estimate, Load, Room, advice, estimate, first_look
-from surfkit.apps.doctor.examine import Examined, Told
+from surfkit.apps.doctor.estimate import FixedCosts, MachineLimits, ResourceEstimate, advice, estimate, first_look
+from surfkit.apps.doctor.examine import ExaminedData, Told
 from surfkit.apps.doctor.finding import Finding, from_errors
 from surfkit.apps.doctor.gather import depth_maps, heard
 from surfkit.apps.doctor.growth import Growth, growth
-from surfkit.apps.doctor.probe import Job, Part, Probed, probe
+from surfkit.apps.doctor.probe import ProbeJob, ProbeResult, ProbeSegment, probe
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import prior_bytes
-from surfkit.io.datasets.panoramas import FOLDER as PANORAMAS
+from surfkit.io.datasets.panoramas import PANORAMAS_FOLDER as PANORAMAS
 from surfkit.io.datasets.panoramas import view_names, view_sizes
 from surfkit.io.datasets.read import build_scene
 from surfkit.io.datasets.undistort import cache_folder, is_pinhole
@@ -31,20 +31,20 @@ from surfkit.scene.memory import cache_bytes, free_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import needs_normals, needs_priors
 
-VIEWS = 10
+PROBE_VIEWS = 10
 """Photographs that the probe trains on, evenly chosen; each part of it sees all of them."""
-PARTS = 5
+SCHEDULE_PARTS = 5
 """Parts of the schedule, each measured at its middle."""
-SECONDS = 120.0
+MAX_PROBE_S = 120.0
 """Most that the steps of a probe take, unless two or three of each part take longer."""
-MOST_POINTS = 1_000_000
+MAX_PROBE_POINTS = 1_000_000
 """Points with which a probe takes steps; what more of them take is extrapolated."""
-POINT_BYTES = 4_000
+PROBE_POINT_BYTES = 4_000
 """Memory of a point, at most; a probe must not fill the machine."""
 
 
 @dataclass(frozen=True)
-class Plan:
+class ProbePlan:
     """How to measure, and for which run.
 
     Attributes:
@@ -63,8 +63,8 @@ class Plan:
 
 
 def forecast(
-    data: Data, recipe: Recipe, examined: Examined, plan: Plan, told: Told | None = None
-) -> tuple[Estimate | None, list[Finding]]:
+    data: Data, recipe: Recipe, examined: ExaminedData, plan: ProbePlan, told: Told | None = None
+) -> tuple[ResourceEstimate | None, list[Finding]]:
     """What the run of a recipe will take, and what to lower where it will not fit.
 
     Args:
@@ -85,10 +85,10 @@ def forecast(
         first = recipe.start.expected(len(scene.cloud.xyz), pixels)
         rising = growth(recipe.pretrain, first, pixels, plan.points, recipe.start.is_dense)
         parts = schedule(recipe.pretrain.steps, rising)
-        held_back = within(parts, min(MOST_POINTS, int(0.4 * room.memory_bytes / POINT_BYTES)))
+        held_back = within(parts, min(MAX_PROBE_POINTS, int(0.4 * room.memory_bytes / PROBE_POINT_BYTES)))
         wanted = load.view_bytes > 0 and needs_priors(recipe.pretrain.losses)
         priors = wanted and bool(_with_maps(data, examined, recipe))
-        job = Job(recipe, scene, held_back, plan.steps, SECONDS, priors, plan.device)
+        job = ProbeJob(recipe, scene, held_back, plan.steps, MAX_PROBE_S, priors, plan.device)
         probed = probe(job, None if told is None else lambda done, all_: told("probe", done, all_))
     if probed.failure is not None or probed.written is None:
         return None, [_failed(probed, held_back)]
@@ -108,24 +108,24 @@ def beyond(recipe: Recipe) -> list[Finding]:
     return [Finding("note", "forecast", text)] if later else []
 
 
-def schedule(steps: int, rising: Growth) -> tuple[Part, ...]:
+def schedule(steps: int, rising: Growth) -> tuple[ProbeSegment, ...]:
     """The middles of equal parts of a run, aside from the round steps at which points are edited."""
-    middles = [round((at + 0.5) / PARTS * steps) for at in range(PARTS)]
+    middles = [round((at + 0.5) / SCHEDULE_PARTS * steps) for at in range(SCHEDULE_PARTS)]
     indices = [at // 100 * 100 + 40 if steps >= 1_000 else at for at in middles]
-    return tuple(Part(at, rising.at(at / steps), 1 / PARTS) for at in indices)
+    return tuple(ProbeSegment(at, rising.at(at / steps), 1 / SCHEDULE_PARTS) for at in indices)
 
 
-def within(parts: Sequence[Part], most: int) -> tuple[Part, ...]:
+def within(parts: Sequence[ProbeSegment], most: int) -> tuple[ProbeSegment, ...]:
     """Parts with at most so many points; of different numbers where all had more, so that a slope can be measured."""
     most = max(1, most)
     if parts[0].points > most:
-        shares = [(at + PARTS) / (2 * PARTS - 1) for at in range(PARTS)]
+        shares = [(at + SCHEDULE_PARTS) / (2 * SCHEDULE_PARTS - 1) for at in range(SCHEDULE_PARTS)]
         return tuple(replace(p, points=max(1, round(s * most))) for p, s in zip(parts, shares, strict=True))
     return tuple(replace(part, points=min(part.points, most)) for part in parts)
 
 
-def _room(data: Data, plan: Plan) -> Room:
-    return Room(free_bytes(), _free_disk(plan.out), _free_disk(cache_folder(data.path)))
+def _room(data: Data, plan: ProbePlan) -> MachineLimits:
+    return MachineLimits(free_bytes(), _free_disk(plan.out), _free_disk(cache_folder(data.path)))
 
 
 def _free_disk(path: Path) -> int:
@@ -134,14 +134,14 @@ def _free_disk(path: Path) -> int:
     return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free
 
 
-def _sizes(data: Data, examined: Examined, names: set[str]) -> list[tuple[int, int]]:
+def _sizes(data: Data, examined: ExaminedData, names: set[str]) -> list[tuple[int, int]]:
     """Widths and heights at which photographs will be used, once for each view that they give."""
     shots, known = examined.gathered.capture.shots, examined.photographs
     looks = [(shot, known[shot.name]) for shot in shots if shot.name in names and shot.name in known]
     return [size for shot, look in looks if look.size for size in view_sizes(data, shot, look.size)]
 
 
-def _with_maps(data: Data, examined: Examined, recipe: Recipe) -> set[str]:
+def _with_maps(data: Data, examined: ExaminedData, recipe: Recipe) -> set[str]:
     """Names of the training photographs that have a depth map, or will have."""
     train = examined.gathered.train
     maps = set(depth_maps(data, examined.gathered))
@@ -149,7 +149,7 @@ def _with_maps(data: Data, examined: Examined, recipe: Recipe) -> set[str]:
     return found or ({shot.name for shot in train} if recipe.depth is not None else set())
 
 
-def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
+def _load(data: Data, recipe: Recipe, examined: ExaminedData, plan: ProbePlan) -> FixedCosts:
     """What does not depend on points, as far as it is known without a probe."""
     gathered = examined.gathered
     train = {shot.name for shot in gathered.train}
@@ -161,7 +161,7 @@ def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
     bent = sum(not is_pinhole(shot.camera) for shot in gathered.capture.shots)
     kept = [*cache_folder(data.path).glob("*.png"), *place(data.path, PANORAMAS).glob("*-front.png")] if bent else []
     there = sum(not path.stem.endswith("-mask") for path in kept)
-    return Load(
+    return FixedCosts(
         steps=recipe.pretrain.steps,
         train=len(view_names(gathered.train)),
         held_out=len(view_names(gathered.capture.shots)) - len(view_names(gathered.train)),
@@ -177,10 +177,10 @@ def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
     )
 
 
-def _scene(data: Data, examined: Examined, load: Load, folder: Path) -> tuple[Scene, Load]:
+def _scene(data: Data, examined: ExaminedData, load: FixedCosts, folder: Path) -> tuple[Scene, FixedCosts]:
     """The scene with a few views, undistorted or cut into a folder of ours, and what that has taken for each."""
     train = examined.gathered.train
-    chosen = [train[at * len(train) // min(VIEWS, len(train))] for at in range(min(VIEWS, len(train)))]
+    chosen = [train[at * len(train) // min(PROBE_VIEWS, len(train))] for at in range(min(PROBE_VIEWS, len(train)))]
     start = time.perf_counter()
     with heard():
         scene = build_scene(data, examined.gathered.capture, folder, set(view_names(chosen)))
@@ -192,7 +192,7 @@ def _scene(data: Data, examined: Examined, load: Load, folder: Path) -> tuple[Sc
     return scene, replace(load, undistort_seconds=seconds, undistort_bytes=written / bent)
 
 
-def _failed(probed: Probed, parts: Sequence[Part]) -> Finding:
+def _failed(probed: ProbeResult, parts: Sequence[ProbeSegment]) -> Finding:
     """What it means that a probe ended early."""
     kind, _, said = (probed.failure or "").partition(": ")
     if kind == BadInput.__name__:

@@ -15,19 +15,19 @@ from surfkit.core.check import BadInput, collecting
 from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import name_of, plugins
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
-from surfkit.io.datasets.masks import FOLDER, MARKS, find_masks, with_opacity
+from surfkit.io.datasets.masks import MASK_MARKS, MASKS_FOLDER, find_masks, with_opacity
 from surfkit.io.datasets.panoramas import view_names
-from surfkit.io.datasets.pixels import Decided, decide
+from surfkit.io.datasets.pixels import PixelInterpretation, decide
 from surfkit.io.datasets.read import model_folder, read_capture, reader_of
-from surfkit.scene.names import PICTURES
-from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.names import PICTURE_SUFFIXES
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask
 
-EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+EMPTY = RawDataset((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Gathered:
     """
 
     layout: str | None
-    capture: Capture
+    capture: RawDataset
     masks: dict[str, Mask]
     held_out: frozenset[str]
     pixels: Mapping[str, Pixels]
@@ -53,7 +53,7 @@ class Gathered:
     findings: tuple[Finding, ...]
 
     @property
-    def train(self) -> list[Shot]:
+    def train(self) -> list[RawImage]:
         """The shots to train on."""
         return [shot for shot in self.capture.shots if shot.name not in self.held_out]
 
@@ -69,7 +69,11 @@ def gather(data: Data, quick: bool = False) -> Gathered:
         except BadInput as error:
             faults.append(error)
         told = not all(mask.alpha for mask in masks.values())  # in words of its own, how many masks there are
-        decided = Decided(dict.fromkeys(files, PLAIN), ()) if quick else decide(files, data.alpha, data.white)
+        decided = (
+            PixelInterpretation(dict.fromkeys(files, DEFAULT_PIXELS), ())
+            if quick
+            else decide(files, data.alpha, data.white)
+        )
         masks = with_opacity(masks, [shot for shot in capture.shots if shot.name in files], decided)
         said = [*said, *list(warnings)[len(said) + told :], *decided.lines]
         held_out: set[str] = set()
@@ -96,7 +100,7 @@ def depth_maps(data: Data, gathered: Gathered) -> dict[str, DepthFile]:
 @contextmanager
 def heard() -> Iterator[list[str]]:
     """Within, warnings are not lost: their texts are in the list."""
-    listener = _Listener()
+    listener = _WarningCollector()
     plugins().register(listener)
     try:
         yield listener.texts
@@ -104,7 +108,7 @@ def heard() -> Iterator[list[str]]:
         plugins().unregister(listener)
 
 
-class _Listener:
+class _WarningCollector:
     """Keeps the texts of warnings."""
 
     def __init__(self) -> None:
@@ -117,7 +121,7 @@ class _Listener:
             self.texts.append(event.text)
 
 
-def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
+def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, RawDataset]:
     """The name of the layout, and what its reader could read."""
     layout = None
     try:
@@ -130,7 +134,7 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
     return layout, capture
 
 
-def _loose(data: Data, shots: Sequence[Shot]) -> tuple[Path, ...]:
+def _loose(data: Data, shots: Sequence[RawImage]) -> tuple[Path, ...]:
     """Pictures in the folders of the photographs that no shot is of; those in images/ where there are no shots."""
     if not data.path.is_dir():
         return ()
@@ -139,10 +143,12 @@ def _loose(data: Data, shots: Sequence[Shot]) -> tuple[Path, ...]:
     folders = [named] if named.is_dir() else sorted({path.parent for path in used})
     found = (path for folder in folders for path in sorted(folder.rglob("*") if folder == named else folder.glob("*")))
     return tuple(
-        path for path in found if path.suffix.lower() in PICTURES and path not in used and not _is_mask(path, data.path)
+        path
+        for path in found
+        if path.suffix.lower() in PICTURE_SUFFIXES and path not in used and not _is_mask(path, data.path)
     )
 
 
 def _is_mask(path: Path, root: Path) -> bool:
     """Whether a picture is called as masks are."""
-    return path.stem.endswith(MARKS) or FOLDER in path.relative_to(root).parts
+    return path.stem.endswith(MASK_MARKS) or MASKS_FOLDER in path.relative_to(root).parts

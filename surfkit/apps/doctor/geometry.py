@@ -11,22 +11,22 @@ import numpy as np
 from surfkit.apps.doctor.finding import Finding, from_errors
 from surfkit.apps.doctor.holes import holes
 from surfkit.core.check import BadInput, few
-from surfkit.io.datasets.capture import Shot
+from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.undistort import check_camera, is_panorama
 from surfkit.scene.scene import Frame
 
-SAMPLE = 4_000
+SAMPLED_POINTS = 4_000
 """Sparse points, evenly drawn, that stand for all of them."""
-BEYOND = 0.3
+MAX_RAY_OVERSHOOT = 0.3
 """Share of the image by which a ray may miss it before its distortion: polynomials fold far rays back in."""
 FAR_CAMERA = 25.0
 """A camera so many times farther out than the median one is no part of the scene."""
 FEW_POINTS, FEW_IN_VIEW, FEW_VIEWS = 1_000, 10, 3
-THIN = 0.2
+MAX_THIN_SHARE = 0.2
 """Share of the points that may be seen by fewer than FEW_VIEWS photographs; the rim of a survey is."""
-NEARER = 0.01
+MAX_NEAR_SHARE = 0.01
 """Share of what is in view that may lie before the near plane."""
-COARSE = 1e-5
+VISIBLE_SPACING_SHARE = 1e-5
 """Spacing of 32-bit numbers at the scene's coordinates, as a share of its extent, that can be seen in a result."""
 
 
@@ -52,7 +52,7 @@ class Geometry:
 
 
 @np.errstate(all="ignore")
-def survey(shots: Sequence[Shot], train: Sequence[Shot], xyz: np.ndarray, near: float) -> Geometry:
+def survey(shots: Sequence[RawImage], train: Sequence[RawImage], xyz: np.ndarray, near: float) -> Geometry:
     """Measure cameras and points; numbers may be as large as they come.
 
     Args:
@@ -64,7 +64,7 @@ def survey(shots: Sequence[Shot], train: Sequence[Shot], xyz: np.ndarray, near: 
     findings = [*_cameras(shots)]
     sound = [shot for shot in train if not _camera_fault(shot)]
     usable = frozenset(shot.name for shot in sound)
-    sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:SAMPLE]]
+    sample = xyz[np.random.default_rng(0).permutation(len(xyz))[:SAMPLED_POINTS]]
     if not sound:
         return Geometry(None, sample, np.zeros(len(sample), int), None, usable, tuple(findings))
     extent = None
@@ -83,12 +83,12 @@ def survey(shots: Sequence[Shot], train: Sequence[Shot], xyz: np.ndarray, near: 
     return Geometry(extent, sample, inside.sum(0), depth, usable, tuple(findings))
 
 
-def centre(shot: Shot) -> np.ndarray:
+def centre(shot: RawImage) -> np.ndarray:
     """(3,) position of a camera, input frame."""
     return -shot.pose[:3, :3].T @ shot.pose[:3, 3]
 
 
-def places(shot: Shot, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def places(shot: RawImage, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where a photograph shows points, if nothing hides them.
 
     Args:
@@ -114,7 +114,7 @@ def places(shot: Shot, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         straight = (flat * focal + [camera.principal_point_x, camera.principal_point_y]) / size
         plausible = (depth > 0) & np.isfinite(flat).all(1)
         if "FISHEYE" not in camera.model.name:
-            plausible &= (np.abs(straight - 0.5) <= 0.5 + BEYOND).all(1)
+            plausible &= (np.abs(straight - 0.5) <= 0.5 + MAX_RAY_OVERSHOOT).all(1)
         if plausible.any():
             pixels = np.asarray(camera.img_from_cam(rays[plausible] / depth[plausible, None]), np.float64)
             found[plausible] = pixels.reshape(-1, 2) / size
@@ -122,15 +122,15 @@ def places(shot: Shot, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found, depth
 
 
-def seen_by(shot: Shot, xyz: np.ndarray) -> Callable[[], np.ndarray]:
+def seen_by(shot: RawImage, xyz: np.ndarray) -> Callable[[], np.ndarray]:
     """Gives the places of points in a photograph when they are needed."""
     return lambda: places(shot, xyz)[0]
 
 
-def _in_view(shots: Sequence[Shot], xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_view(shots: Sequence[RawImage], xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(V, S) bool, which points are in view; depths of all of them, input units, or of an even part."""
 
-    def look(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    def look(shot: RawImage) -> tuple[np.ndarray, np.ndarray]:
         where, depth = places(shot, xyz)
         inside = np.isfinite(where[:, 0])
         return inside, np.sort(depth[inside])[::10]
@@ -140,7 +140,7 @@ def _in_view(shots: Sequence[Shot], xyz: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.stack([inside for inside, _ in found]), np.concatenate([depth for _, depth in found])
 
 
-def _camera_fault(shot: Shot) -> str | None:
+def _camera_fault(shot: RawImage) -> str | None:
     try:
         check_camera(shot.camera, shot.name)
     except BadInput as error:
@@ -148,7 +148,7 @@ def _camera_fault(shot: Shot) -> str | None:
     return None
 
 
-def _cameras(shots: Sequence[Shot]) -> list[Finding]:
+def _cameras(shots: Sequence[RawImage]) -> list[Finding]:
     """What is wrong with the lenses; one line for each camera."""
     first = {id(shot.camera): shot for shot in reversed(shots)}
     faults = {key: text for key, shot in first.items() if (text := _camera_fault(shot))}
@@ -159,7 +159,7 @@ def _cameras(shots: Sequence[Shot]) -> list[Finding]:
     ]
 
 
-def _poses(shots: Sequence[Shot]) -> list[Finding]:
+def _poses(shots: Sequence[RawImage]) -> list[Finding]:
     """Cameras far from all others, and such as stand in one place."""
     centres = np.stack([centre(shot) for shot in shots])
     distance = np.linalg.norm(centres - np.median(centres, 0), axis=1)
@@ -182,13 +182,13 @@ def _poses(shots: Sequence[Shot]) -> list[Finding]:
     return found
 
 
-def _numbers(shots: Sequence[Shot], xyz: np.ndarray, extent: float | None) -> list[Finding]:
+def _numbers(shots: Sequence[RawImage], xyz: np.ndarray, extent: float | None) -> list[Finding]:
     """Coordinates that 32 bits hold badly."""
     if extent is None:
         return []
     most = np.float32(np.abs(np.median(np.stack([centre(shot) for shot in shots]), 0)).max())
     spacing = float(np.spacing(most))
-    if spacing <= COARSE * extent:
+    if spacing <= VISIBLE_SPACING_SHARE * extent:
         return []
     text = (
         f"coordinates of up to {most:,.0f} in a scene of {extent:,.3g} units, of which 32 bits hold {spacing:.2g} "
@@ -197,7 +197,7 @@ def _numbers(shots: Sequence[Shot], xyz: np.ndarray, extent: float | None) -> li
     return [Finding("note", "large-coordinates", text)]
 
 
-def _points(shots: Sequence[Shot], xyz: np.ndarray, inside: np.ndarray) -> list[Finding]:
+def _points(shots: Sequence[RawImage], xyz: np.ndarray, inside: np.ndarray) -> list[Finding]:
     """Points that no photograph shows, and photographs without points."""
     found, views = [], inside.sum(0)
     unseen, thin = float((views == 0).mean()), float(((views > 0) & (views < FEW_VIEWS)).mean())
@@ -207,7 +207,7 @@ def _points(shots: Sequence[Shot], xyz: np.ndarray, inside: np.ndarray) -> list[
             "not in one frame, or the axes are of another convention; look at both in a viewer"
         )
         found.append(Finding("error" if unseen == 1 else "warning", "points-out-of-view", text))
-    elif thin + unseen > THIN:
+    elif thin + unseen > MAX_THIN_SHARE:
         text = (
             f"{thin + unseen:.0%} of the sparse points are in view of fewer than {FEW_VIEWS} training photographs, so "
             "the surface there will be poor; add photographs, or hold out fewer (--test-every)"
@@ -234,7 +234,7 @@ def _nearness(depths: np.ndarray, extent: float | None, near: float) -> list[Fin
     if extent is None or not len(depths):
         return []
     cut, typical = float((depths < near * extent).mean()), float(np.median(depths))
-    if cut > NEARER:
+    if cut > MAX_NEAR_SHARE:
         text = (
             f"{cut:.0%} of what is in view lies nearer to the camera than the near plane of {near * extent:.3g} units, "
             f"and would not be drawn; use --pretrain.near {max(1e-6, np.quantile(depths, 0.001) / extent / 2):.1g}"

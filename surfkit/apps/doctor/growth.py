@@ -16,9 +16,9 @@ half of that is reached. A rule of thumb: runs of 2DGS on two aerial scenes mult
 DENSE_FACTOR = 5.0
 """The same for points that begin dense. Runs of recipe:surface on two aerial scenes multiplied theirs by 1.1, 1.2 and
 1.5 with 2, 6 and 11 edits, and by 1.4, 1.8 and 3.3 with 2, 4 and 14."""
-PER_PIXEL = 0.3
+MAX_POINTS_PER_PIXEL = 0.3
 """Never more points than this share of the pixels of all training photographs."""
-SPREAD = 3.0
+FORECAST_SPREAD_FACTOR = 3.0
 """The true number may be smaller or larger by this factor."""
 USUAL_EVERY = 100
 """Steps between edits of a densifier that does not tell when it edits."""
@@ -70,7 +70,7 @@ def growth(stage: Stage, first: int, pixels: int, given: int | None = None, is_d
         return Growth(first, first, (), True)
     edits = edit_shares(stage.densify, stage.steps)
     most = DENSE_FACTOR if is_dense else MAX_FACTOR
-    likely = max(first, min(round(first * factor(len(edits), most)), round(PER_PIXEL * pixels)))
+    likely = max(first, min(round(first * factor(len(edits), most)), round(MAX_POINTS_PER_PIXEL * pixels)))
     limit = stage.densify.most_points
     last = given if given is not None else min(likely, max(limit or likely, first))
     known = given is not None or not edits or (limit is not None and last >= limit)

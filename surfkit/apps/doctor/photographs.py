@@ -16,13 +16,13 @@ from surfkit.apps.doctor.exposure import luminance
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.masks import check_mask, read_mask
 from surfkit.scene.photos import open_header, read_draft
-from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask
 
-DRAFT = 256
+DRAFT_SIDE_PX = 256
 """Longer side at which photographs are looked at, pixels, or up to twice that."""
-UPRIGHT = 1
-ORIENTATION = 0x0112
+UPRIGHT_ORIENTATION = 1
+ORIENTATION_TAG = 0x0112
 """What EXIF calls the way a photograph is to be turned."""
 
 
@@ -58,7 +58,7 @@ Places = Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Wanted:
+class PhotoToExamine:
     """A photograph to look at.
 
     Attributes:
@@ -71,10 +71,10 @@ class Wanted:
     path: Path
     mask: Mask | None = None
     places: Places | None = None
-    pixels: Pixels = PLAIN
+    pixels: Pixels = DEFAULT_PIXELS
 
 
-def look_at(wanted: Sequence[Wanted], quick: bool = False) -> Iterator[Photograph]:
+def look_at(wanted: Sequence[PhotoToExamine], quick: bool = False) -> Iterator[Photograph]:
     """A look at each photograph, in order; in memory are only those that threads have in hand.
 
     Args:
@@ -90,13 +90,13 @@ def look_at(wanted: Sequence[Wanted], quick: bool = False) -> Iterator[Photograp
             pending += [pool.submit(_look, one, quick) for one in islice(waiting, 1)]
 
 
-def _look(wanted: Wanted, quick: bool) -> Photograph:
+def _look(wanted: PhotoToExamine, quick: bool) -> Photograph:
     found: dict = {}
     try:
         found["bytes"] = wanted.path.stat().st_size
         open_header(wanted.path, lambda image: found.update(_header(image)))
         if not quick:
-            found |= _pixels(read_draft(wanted.path, DRAFT, wanted.pixels), wanted.places)
+            found |= _pixels(read_draft(wanted.path, DRAFT_SIDE_PX, wanted.pixels), wanted.places)
     except BadInput as error:
         found["fault"] = str(error)
     except OSError as error:
@@ -108,7 +108,7 @@ def _look(wanted: Wanted, quick: bool) -> Photograph:
 
 def _header(image: Image.Image) -> dict:
     there = "exif" in image.info  # without it, some formats would decode all to search for it
-    turned = there and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT
+    turned = there and image.getexif().get(ORIENTATION_TAG, UPRIGHT_ORIENTATION) != UPRIGHT_ORIENTATION
     return {"size": image.size, "kind": f"{image.format} {image.mode}", "turned": turned}
 
 
@@ -123,8 +123,8 @@ def _mask(mask: Mask, size: tuple[int, int] | None, quick: bool) -> dict:
             check_mask(mask.path, size)
         if quick:
             return {}
-        by = max(1, max(size or (DRAFT, DRAFT)) // DRAFT)
-        width, height = size or (DRAFT, DRAFT)
+        by = max(1, max(size or (DRAFT_SIDE_PX, DRAFT_SIDE_PX)) // DRAFT_SIDE_PX)
+        width, height = size or (DRAFT_SIDE_PX, DRAFT_SIDE_PX)
         seen = read_mask(mask.path, (max(1, width // by), max(1, height // by)), mask.alpha)
         return {"kept": float(seen.float().mean())}
     except BadInput as error:

@@ -12,7 +12,7 @@ from surfkit.core.events import reading_again
 from surfkit.core.registry import name_of
 from surfkit.depth.prepare import REMEDY, others_warning
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.depth_prior import OFF, alignment, normals_warning, prepare_command
+from surfkit.io.datasets.depth_prior import SWITCHED_OFF, alignment, normals_warning, prepare_command
 from surfkit.io.datasets.panoramas import has_panoramas, points_remedy, view_names, view_sizes
 from surfkit.io.datasets.read import build_scene, reader_of
 from surfkit.runs.recipe import Recipe
@@ -36,7 +36,7 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
     make = prepare_command(data) if tracks else points_remedy(data.path, names)
     if not tracks and recipe.depth is not None:
         text = "there are no depth priors, and none can be made, as no photograph observes any sparse point"
-        text = f"the run begins at depth maps: {text}" if stereo else f"{text}, so {OFF}"
+        text = f"the run begins at depth maps: {text}" if stereo else f"{text}, so {SWITCHED_OFF}"
         found = Finding("error" if stereo else "warning", "depth-priors", f"{text}; {make}")
         return [found, *(_normals_to_come(recipe) if normals else [])]
     if not maps and recipe.depth is not None:
@@ -46,7 +46,7 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
         begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
         return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
     if not maps:
-        text = f"the recipe uses depth priors, and there are no depth priors, so {OFF}; {make}"
+        text = f"the recipe uses depth priors, and there are no depth priors, so {SWITCHED_OFF}; {make}"
         return [Finding("warning", "depth-priors", text)]
     found = []
     if missing := [name for name in names if name not in maps]:

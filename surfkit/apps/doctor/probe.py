@@ -69,7 +69,7 @@ class EditStress(Prune):
 
 
 @dataclass(frozen=True)
-class Part:
+class ProbeSegment:
     """A part of the schedule, measured at its middle.
 
     Attributes:
@@ -84,7 +84,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Job:
+class ProbeJob:
     """What to measure.
 
     Attributes:
@@ -99,7 +99,7 @@ class Job:
 
     recipe: Recipe
     scene: Scene
-    parts: tuple[Part, ...]
+    parts: tuple[ProbeSegment, ...]
     steps: int
     seconds: float
     priors: bool
@@ -107,7 +107,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Started:
+class ProbeStart:
     """Measured before the first step.
 
     Attributes:
@@ -124,7 +124,7 @@ class Started:
 
 
 @dataclass(frozen=True)
-class Taken:
+class SegmentCosts:
     """Measured in one part.
 
     Attributes:
@@ -141,7 +141,7 @@ class Taken:
 
 
 @dataclass(frozen=True)
-class Written:
+class ProbeOutput:
     """Measured after the last step.
 
     Attributes:
@@ -162,7 +162,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Probed:
+class ProbeResult:
     """What a probe has measured.
 
     Attributes:
@@ -172,13 +172,13 @@ class Probed:
         failure: Why it ended early, in a few words; None if it did not.
     """
 
-    started: Started | None
-    taken: tuple[Taken, ...]
-    written: Written | None
+    started: ProbeStart | None
+    taken: tuple[SegmentCosts, ...]
+    written: ProbeOutput | None
     failure: str | None = None
 
 
-def probe(job: Job, told: Callable[[int, int], None] | None = None) -> Probed:
+def probe(job: ProbeJob, told: Callable[[int, int], None] | None = None) -> ProbeResult:
     """Measure, in a new process.
 
     Args:
@@ -190,13 +190,13 @@ def probe(job: Job, told: Callable[[int, int], None] | None = None) -> Probed:
     process = context.Process(target=_work, args=(theirs, pickle.dumps(job)), daemon=True)
     process.start()
     theirs.close()
-    found: list[Started | Taken | Written | str] = []
+    found: list[ProbeStart | SegmentCosts | ProbeOutput | str] = []
     try:
         with suppress(EOFError):
             while True:
                 found.append(ours.recv())
                 if told is not None:
-                    told(sum(isinstance(one, Taken) for one in found), len(job.parts))
+                    told(sum(isinstance(one, SegmentCosts) for one in found), len(job.parts))
         process.join()
     finally:
         process.kill()
@@ -204,10 +204,10 @@ def probe(job: Job, told: Callable[[int, int], None] | None = None) -> Probed:
     if failure is None and process.exitcode:
         killed = process.exitcode == -signal.SIGKILL
         failure = "the system killed it, as it does when memory runs out" if killed else "it crashed"
-    return Probed(
-        next((one for one in found if isinstance(one, Started)), None),
-        tuple(one for one in found if isinstance(one, Taken)),
-        next((one for one in found if isinstance(one, Written)), None),
+    return ProbeResult(
+        next((one for one in found if isinstance(one, ProbeStart)), None),
+        tuple(one for one in found if isinstance(one, SegmentCosts)),
+        next((one for one in found if isinstance(one, ProbeOutput)), None),
         failure,
     )
 
@@ -226,7 +226,7 @@ def _work(connection: Connection, job: bytes) -> None:
         connection.close()
 
 
-def measure(job: Job) -> Iterator[Started | Taken | Written]:
+def measure(job: ProbeJob) -> Iterator[ProbeStart | SegmentCosts | ProbeOutput]:
     """Measure, in this process."""
     load_pycolmap()  # a run has loaded it too, to read the data
     recipe, views, start = job.recipe, job.scene.train, time.perf_counter()
@@ -241,7 +241,7 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator), recipe.primitive.shared())
     init_seconds, rasterizer = time.perf_counter() - start, select(job.device)[0]
     on_gpu = rasterizer.where().type == "cuda"
-    yield Started(photo_seconds, init_seconds, held, free_gpu_bytes() if on_gpu else 0)
+    yield ProbeStart(photo_seconds, init_seconds, held, free_gpu_bytes() if on_gpu else 0)
     churn = EditStress(tuple(part.index + 1 for part in job.parts))
     stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
     trainer = Trainer(stage, recipe.primitive, views, photos, rasterizer, priors, masks, beside=_next_of(len(views)))
@@ -274,7 +274,9 @@ def _made_up_prior(view: View, normals: bool) -> DepthPrior:
     return DepthPrior(ones, ones.clone(), 1.0, towards)
 
 
-def _taken(trainer: Trainer, state: StageState, part: Part, job: Job, kinds: dict[bool, list[int]]) -> Taken:
+def _taken(
+    trainer: Trainer, state: StageState, part: ProbeSegment, job: ProbeJob, kinds: dict[bool, list[int]]
+) -> SegmentCosts:
     """Take steps of a part, with an edit in the first, and then of the kind (`by_kind`) that was not among them."""
     state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
     state.index = part.index
@@ -292,7 +294,7 @@ def _taken(trainer: Trainer, state: StageState, part: Part, job: Job, kinds: dic
             state.index = index - 1
             own = [_timed(trainer, state)[1]]
         seconds += statistics.median(own) * len(indices) / sum(map(len, kinds.values()))
-    return Taken(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes())
+    return SegmentCosts(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes())
 
 
 def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:
@@ -302,7 +304,7 @@ def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:
     return trainer.stage.is_paired(state.index), time.perf_counter() - start
 
 
-def _written(trainer: Trainer, state: StageState) -> Written:
+def _written(trainer: Trainer, state: StageState) -> ProbeOutput:
     """Write what a run writes, into a folder that is deleted at once."""
     count, view = len(state.points), trainer.views[0]
     with tempfile.TemporaryDirectory(prefix="surfkit-doctor-") as name:
@@ -316,7 +318,7 @@ def _written(trainer: Trainer, state: StageState) -> Written:
         write_splats(folder / "cloud.ply", trainer.primitive.table(state.points.all_params()))
         sizes = {path.stem: path.stat().st_size for path in folder.iterdir()}
     per_point = sizes["checkpoint"] / count, sizes["cloud"] / count
-    return Written(*per_point, sizes["picture"], draw_seconds, save_seconds, peak_memory_bytes())
+    return ProbeOutput(*per_point, sizes["picture"], draw_seconds, save_seconds, peak_memory_bytes())
 
 
 def with_count(primitive: Primitive, points: Points, count: int, generator: torch.Generator) -> Points:

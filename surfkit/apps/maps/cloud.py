@@ -7,25 +7,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from surfkit.apps.maps.bins import FACES
-from surfkit.apps.maps.geotiff import Sheet
-from surfkit.apps.maps.surface_model import COLORS, has_colors
+from surfkit.apps.maps.bins import BATCH_TRIANGLES
+from surfkit.apps.maps.geotiff import GeoTiffSettings
+from surfkit.apps.maps.surface_model import COLOR_CHANNELS, has_colors
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.optional import needed
 from surfkit.core.version import own_version
-from surfkit.evaluate.geometry.sampling import STEPS
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.sampling import R2_STEPS
+from surfkit.evaluate.geometry.surface import SurfaceFile
 
-AT_ONCE = 1 << 20
+BATCH_POINTS = 1 << 20
 """Points in memory."""
-SOURCE = 1
+POINT_SOURCE_ID = 1
 """Point source ID: points of the mesh."""
-FINEST = 1000
+STEPS_PER_SPACING = 1000
 """Steps of a coordinate within the distance of points."""
 
 
-def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> int:
+def write_cloud(surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing: float) -> int:
     """Write points on a mesh, one for each square of so long a side, and return how many there are.
 
     Point format 7: coordinates, and colours of 16 bits where the mesh has some; the coordinate reference system as
@@ -48,8 +48,8 @@ def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> in
     west, south, east, north = sheet.grid.bounds
     header = laspy.LasHeader(version="1.4", point_format=7 if has_colors(surface) else 6)
     header.generating_software = f"surfkit {own_version()}"
-    header.file_source_id = SOURCE
-    step = 10.0 ** math.floor(math.log10(spacing) - math.log10(FINEST) + 0.5)
+    header.file_source_id = POINT_SOURCE_ID
+    step = 10.0 ** math.floor(math.log10(spacing) - math.log10(STEPS_PER_SPACING) + 0.5)
     header.scales = np.full(3, step)
     first = next(block for block in surface.blocks() if len(block))
     header.offsets = np.round([(west + east) / 2, (south + north) / 2, sheet.grid.to_map(first)[:, 2].mean()])
@@ -65,9 +65,9 @@ def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> in
             record = laspy.ScaleAwarePointRecord.zeros(int(inside.sum()), header=header)
             record.x, record.y, record.z = places[inside].T
             record.return_number[:] = record.number_of_returns[:] = 1
-            record.point_source_id[:] = SOURCE
+            record.point_source_id[:] = POINT_SOURCE_ID
             if colors is not None:
-                for channel, color in enumerate(COLORS):
+                for channel, color in enumerate(COLOR_CHANNELS):
                     record[color] = colors[inside, channel].astype(np.uint16) * 257
             writer.write_points(record)
             count += len(record)
@@ -75,7 +75,7 @@ def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> in
     return count
 
 
-def sample_evenly(surface: Surface, area: float) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
     """Points of a mesh, one for each so large part of its area, in the order of its triangles: (n, 3) float64
     positions, and (n, 3) uint8 colours where the mesh has some.
 
@@ -83,25 +83,25 @@ def sample_evenly(surface: Surface, area: float) -> Iterator[tuple[np.ndarray, n
     low-discrepancy sequence. So there are the same points however many are made at once.
     """
     colored, so_far, number = has_colors(surface), 0.0, 0
-    for start in range(0, len(surface.faces), FACES):
-        faces = np.asarray(surface.faces[start : start + FACES])
+    for start in range(0, len(surface.faces), BATCH_TRIANGLES):
+        faces = np.asarray(surface.faces[start : start + BATCH_TRIANGLES])
         corners = surface.vertices(faces.ravel()).reshape(-1, 3, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         ends = so_far + np.cumsum(np.linalg.norm(normals, axis=1) / 2)
         so_far = float(ends[-1])
         last = max(number, math.ceil(so_far / area - 0.5))
         while number < last:
-            order = np.arange(number, min(last, number + AT_ONCE))
+            order = np.arange(number, min(last, number + BATCH_POINTS))
             number += len(order)
             owner = np.searchsorted(ends, (order + 0.5) * area, "right").clip(max=len(ends) - 1)
-            spot = (order[:, None] * STEPS) % 1
+            spot = (order[:, None] * R2_STEPS) % 1
             spot = np.where(spot.sum(1, keepdims=True) > 1, 1 - spot, spot)
             shares = np.stack([1 - spot.sum(1), spot[:, 0], spot[:, 1]], axis=1)
             places = (shares[:, :, None] * corners[owner]).sum(1)
             colors = None
             if colored:
                 rows = surface.rows[faces[owner].ravel()]
-                values = np.stack([rows[name].reshape(-1, 3) for name in COLORS], axis=2)
+                values = np.stack([rows[name].reshape(-1, 3) for name in COLOR_CHANNELS], axis=2)
                 colors = np.rint((shares[:, :, None] * values).sum(1)).astype(np.uint8)
             yield places, colors
-        emit(Progress("sampling points", min(start + FACES, len(surface.faces)), len(surface.faces)))
+        emit(Progress("sampling points", min(start + BATCH_TRIANGLES, len(surface.faces)), len(surface.faces)))

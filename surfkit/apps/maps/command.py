@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import tyro
 
 from surfkit.apps.maps.grid import same_crs
-from surfkit.apps.maps.make import RECORD, MapSettings, make_maps
-from surfkit.apps.texture.make import Subject
+from surfkit.apps.maps.make import MAPS_RECORD, MapSettings, make_maps
+from surfkit.apps.texture.make import MeshWithPhotos
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.highest import highest
 from surfkit.evaluate.geometry.place import same_plan
-from surfkit.evaluate.geometry.surface import Surface, read_mesh, read_surface, system_of
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_mesh, read_surface, system_of
 from surfkit.runs.command import refuse_no_mesh
 from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import opened
@@ -27,7 +27,7 @@ from surfkit.train.bars import bars
 
 
 @dataclass(frozen=True)
-class MapsOf:
+class MapsCommand:
     """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
@@ -69,11 +69,11 @@ class MapsOf:
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(frame)
-            record = make_maps(Subject(surface, frame, scene.train), self.settings, out, other)
+            record = make_maps(MeshWithPhotos(surface, frame, scene.train), self.settings, out, other)
             note_held_out(run, scene)
         show(out, record)
 
-    def _other(self, frame: Frame) -> Surface:
+    def _other(self, frame: Frame) -> SurfaceFile:
         """The mesh to subtract; BadInput if it is known to lie in other coordinates."""
         if not self.against.is_dir():
             theirs = system_of(self.against)
@@ -96,7 +96,7 @@ class MapsOf:
         return read_mesh(run.mesh)
 
 
-def heights_of(path: Path) -> Surface:
+def heights_of(path: Path) -> SurfaceFile:
     """The surface in a file whose heights can be subtracted: a mesh, a raster of heights, or the highest points of a
     cloud."""
     found = read_surface(path)
@@ -135,7 +135,7 @@ def show(out: Path, record: dict[str, Any]) -> None:
         ]
     print_table(("map", "value"), rows)
     print()
-    print_table(("written",), [(str(out / name),) for name in (*record["files"], RECORD)])
+    print_table(("written",), [(str(out / name),) for name in (*record["files"], MAPS_RECORD)])
 
 
-COMMAND = MapsOf
+COMMAND = MapsCommand

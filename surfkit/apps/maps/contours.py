@@ -8,30 +8,30 @@ from pathlib import Path
 
 import numpy as np
 
-from surfkit.apps.maps.geotiff import TILES, Sheet
-from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.geotiff import TILES_SUFFIX, GeoTiffSettings
+from surfkit.apps.maps.grid import MapGrid, Window
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
 
-STEPS = 20
+AUTO_LEVELS = 20
 """About how many levels an automatic interval gives."""
-MOST_LEVELS = 10_000
+MAX_CONTOUR_LEVELS = 10_000
 """Of a map."""
-LINE = 2
+WKB_LINESTRING = 2
 """LineString in well-known binary."""
 
 
 def even_interval(lowest: float, highest: float) -> float:
     """1, 2 or 5 times a power of ten, so that there are 20 levels or somewhat fewer between two heights."""
-    least = max((highest - lowest) / STEPS, 1e-9 * max(abs(lowest), abs(highest), 1e-9))
+    least = max((highest - lowest) / AUTO_LEVELS, 1e-9 * max(abs(lowest), abs(highest), 1e-9))
     power = 10.0 ** math.floor(math.log10(least))
     return float(f"{next(step * power for step in (1, 2, 5, 10) if step * power >= least * (1 - 1e-9)):.1g}")
 
 
-def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side: int) -> int:
+def write_contours(sheet: GeoTiffSettings, heights: str, name: str, interval: float, side: int) -> int:
     """Write the contour lines of a surface model of `sheet.out`, and return how many there are.
 
     Lines are cut where tiles meet, and their ends are the same there to the last bit. They end where there is no
@@ -49,7 +49,7 @@ def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side:
     import rasterio
 
     grid, path, count = sheet.grid, sheet.folder / name, 0
-    windows, tiles = list(grid.tiles(side)), sheet.folder / f"{name}{TILES}"
+    windows, tiles = list(grid.tiles(side)), sheet.folder / f"{name}{TILES_SUFFIX}"
     tiles.mkdir(exist_ok=True)
     with rasterio.open(sheet.out / heights) as model:
         for at, window in enumerate(windows):
@@ -94,7 +94,9 @@ def _kept(path: Path) -> list[tuple[float, np.ndarray]]:
         return list(zip(found["levels"].tolist(), lines, strict=True))
 
 
-def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: float) -> list[tuple[float, np.ndarray]]:
+def contour_lines(
+    heights: np.ndarray, grid: MapGrid, window: Window, interval: float
+) -> list[tuple[float, np.ndarray]]:
     """Levels and lines, (n, 2) float64 easting and northing, of the heights at the centres of a window of cells.
 
     Between centres heights are linear along the sides of the squares of four of them, as in all programs.
@@ -114,8 +116,8 @@ def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: flo
     if min(heights.shape) < 2 or not known.any():
         return []
     first, last = math.ceil(heights[known].min() / interval), math.floor(heights[known].max() / interval)
-    if last - first > MOST_LEVELS:
-        raise BadInput(f"--interval {interval:g}: more than {MOST_LEVELS:,} levels; give a larger one")
+    if last - first > MAX_CONTOUR_LEVELS:
+        raise BadInput(f"--interval {interval:g}: more than {MAX_CONTOUR_LEVELS:,} levels; give a larger one")
     columns = np.arange(window.left, window.left + window.width) + 0.5
     rows = np.arange(window.top, window.top + window.height) + 0.5
     tracer = contour_generator(columns, rows, np.ma.masked_array(heights, ~known))
@@ -131,4 +133,4 @@ def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: flo
 
 def _binary(line: np.ndarray) -> bytes:
     """Well-known binary of a line of (n, 2) float64."""
-    return struct.pack("<BII", 1, LINE, len(line)) + line.astype("<f8").tobytes()
+    return struct.pack("<BII", 1, WKB_LINESTRING, len(line)) + line.astype("<f8").tobytes()

@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.maps.geotiff import Sheet
+from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.rasters import NODATA
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import replacing
 
-PIXELS = 1400
+MAP_LONGEST_PX = 1400
 """Longest side of the map in the picture."""
-BINS = 1 << 20
+HISTOGRAM_BINS = 1 << 20
 """Of the histogram that percentiles are read from."""
-SHOWN = 95
+COLOR_PERCENTILE = 95
 """Percentile of the absolute differences at the ends of the colours."""
-INCHES, DPI = (11.0, 9.0), 130
+PICTURE_INCHES, PICTURE_DPI = (11.0, 9.0), 130
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Difference:
     only_other: int
 
 
-def write_difference(sheet: Sheet, heights: tuple[Path, Path], name: str, side: int) -> Difference:
+def write_difference(sheet: GeoTiffSettings, heights: tuple[Path, Path], name: str, side: int) -> Difference:
     """Write the difference of two surface models on the grid of the sheet, in tiles of so many cells.
 
     Volumes are sums over cells, each as high as its centre. Percentiles are within a millionth of the range.
@@ -96,7 +96,7 @@ def _counted(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, float]:
+def _percentiles(sheet: GeoTiffSettings, name: str, side: int) -> tuple[float, float, float]:
     """Median, median of the absolute values, and 90th percentile of these, from histograms."""
     import rasterio
 
@@ -110,11 +110,11 @@ def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, floa
         most = max(float(np.abs(values).max(initial=0)) for values in differences())
         if not most:
             return 0.0, 0.0, 0.0
-        signed, absolute = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
+        signed, absolute = np.zeros(HISTOGRAM_BINS, np.int64), np.zeros(HISTOGRAM_BINS, np.int64)
         for values in differences():
-            signed += np.histogram(values, BINS, (-most, most))[0]
-            absolute += np.histogram(np.abs(values), BINS, (0, most))[0]
-    middles = (np.arange(BINS) + 0.5) / BINS * most
+            signed += np.histogram(values, HISTOGRAM_BINS, (-most, most))[0]
+            absolute += np.histogram(np.abs(values), HISTOGRAM_BINS, (0, most))[0]
+    middles = (np.arange(HISTOGRAM_BINS) + 0.5) / HISTOGRAM_BINS * most
 
     def at(counts: np.ndarray, share: float) -> float:
         """As numpy's percentile: between two values where it falls there, so the median of an even number is a mean."""
@@ -140,16 +140,16 @@ def draw_difference(path: Path, raster: Path, found: Difference, unit: str) -> N
     from rasterio.enums import Resampling
 
     with rasterio.open(raster) as file:
-        by = max(1.0, max(file.width, file.height) / PIXELS)
+        by = max(1.0, max(file.width, file.height) / MAP_LONGEST_PX)
         shape = max(1, round(file.height / by)), max(1, round(file.width / by))
         shown = file.read(1, out_shape=shape, masked=True, resampling=Resampling.average)
         west, south, east, north = file.bounds
-    reach = max(float(np.percentile(np.abs(shown.compressed()), SHOWN)), 1e-9)
+    reach = max(float(np.percentile(np.abs(shown.compressed()), COLOR_PERCENTILE)), 1e-9)
     rows, columns = (np.flatnonzero(~np.ma.getmaskarray(shown).all(axis)) for axis in (1, 0))
     wide, high = (east - west) / shape[1], (north - south) / shape[0]
     style = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
     with matplotlib.rc_context(style):
-        figure = Figure(INCHES, DPI, layout="constrained")
+        figure = Figure(PICTURE_INCHES, PICTURE_DPI, layout="constrained")
         axes = figure.add_subplot(xlabel=f"easting, {unit}", ylabel=f"northing, {unit}")
         axes.set_facecolor("0.85")
         drawn = axes.imshow(shown, "RdBu_r", vmin=-reach, vmax=reach, extent=(west, east, south, north))

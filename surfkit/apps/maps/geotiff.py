@@ -15,9 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surfkit.apps.maps.grid import Grid
-from surfkit.apps.maps.ours import NAMES, WORK, claim, forget_unfinished, keep_names, own_files, refuse_foreign
-from surfkit.apps.maps.rasters import BLOCK, Kind, Raster
+from surfkit.apps.maps.grid import MapGrid
+from surfkit.apps.maps.ours import (
+    NAMES_FILE,
+    UNFINISHED_FOLDER,
+    claim,
+    forget_unfinished,
+    keep_names,
+    own_files,
+    refuse_foreign,
+)
+from surfkit.apps.maps.rasters import TILE_SIDE_CELLS, Kind, Raster
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
@@ -25,18 +33,18 @@ from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
 from surfkit.core.stages import kept_parts
 
-CACHE = 256
+GDAL_CACHE_MB = 256
 """Megabytes of GDAL's own cache of blocks."""
-LEAST_FREE = 1 << 20
+MIN_FREE_DISK_BYTES = 1 << 20
 """Bytes of a disk, below which it is full."""
 NOT_WRITTEN = re.compile("write (error|failed)|no space", re.IGNORECASE)
 """How GDAL says that a file could not be written."""
-TILES = ".tiles"
+TILES_SUFFIX = ".tiles"
 """Ending of the names of folders with the tiles of a raster."""
 
 
 @dataclass(frozen=True)
-class Sheet:
+class GeoTiffSettings:
     """What the files of a map have in common.
 
     Attributes:
@@ -48,7 +56,7 @@ class Sheet:
         replaced: Names of files of maps before that are deleted when the first new one is there.
     """
 
-    grid: Grid
+    grid: MapGrid
     crs: Any
     folder: Path
     out: Path
@@ -64,16 +72,16 @@ class Sheet:
         """
         import rasterio
 
-        folder = self.folder / f"{name}{TILES}"
+        folder = self.folder / f"{name}{TILES_SUFFIX}"
         folder.mkdir(exist_ok=True)
         raster = Raster(folder, self.grid, self.crs, kind, self.double)
-        with rasterio.Env(GDAL_CACHEMAX=CACHE):
+        with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
             yield raster
         refuse_full(self.folder)
         emit(Progress(f"compressing {name}", 0, 1))
         finished = self.folder / name
         layout = {
-            "blocksize": BLOCK,
+            "blocksize": TILE_SIDE_CELLS,
             "compress": "DEFLATE",
             "predictor": "YES",
             "overviews": "IGNORE_EXISTING",
@@ -81,7 +89,7 @@ class Sheet:
             "bigtiff": "IF_SAFER",
             "sparse_ok": True,
         }
-        with rasterio.Env(GDAL_CACHEMAX=CACHE, CPL_TMPDIR=str(self.folder)):
+        with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB, CPL_TMPDIR=str(self.folder)):
             from rasterio.shutil import copy
 
             copy(raster.whole(), finished, driver="COG", **layout)
@@ -102,7 +110,7 @@ class Sheet:
                 return known["facts"]
         facts = make()
         write_json(record, {"facts": facts, "files": self._stamps(names)})
-        for tiles in self.folder.glob(f"*{TILES}"):
+        for tiles in self.folder.glob(f"*{TILES_SUFFIX}"):
             shutil.rmtree(tiles)
         return facts
 
@@ -126,7 +134,7 @@ class Sheet:
 
 def refuse_full(folder: Path) -> None:
     """OSError if the disk is full: GDAL does not always say that what it wrote last found no room."""
-    if shutil.disk_usage(folder).free < LEAST_FREE:
+    if shutil.disk_usage(folder).free < MIN_FREE_DISK_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
@@ -146,7 +154,7 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
     """
     for name in names:
         refuse_special(out / name)
-    folder = out / WORK
+    folder = out / UNFINISHED_FOLDER
     with locked(out):
         refuse_foreign(out, names)
         sweep(out, deep=False)
@@ -161,9 +169,9 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
                     raise
                 finally:
                     if not own_files(out):  # nothing is finished, nor was
-                        (folder / NAMES).unlink(missing_ok=True)
+                        (folder / NAMES_FILE).unlink(missing_ok=True)
         except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
-            full = shutil.disk_usage(out).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
+            full = shutil.disk_usage(out).free < MIN_FREE_DISK_BYTES or NOT_WRITTEN.search(str(error))
             if isinstance(error, BadInput) or not full:
                 raise
             raise Fault(

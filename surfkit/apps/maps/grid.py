@@ -15,9 +15,9 @@ from surfkit.core.optional import needed
 from surfkit.scene.crs import TOPOCENTRIC, refuse_other_unit, scale_at
 from surfkit.scene.scene import Frame
 
-MOST_CELLS = 4e10
+MAX_MAP_CELLS = 4e10
 """Of a map: twice those of 14 x 14 km at 0.1 m."""
-STRETCHED, TOO_STRETCHED = 0.01, 0.1
+QUIET_SCALE_ERROR, MAX_SCALE_ERROR = 0.01, 0.1
 """Shares by which lengths on a map differ from those on the ground: a line tells of it; no map is drawn."""
 
 
@@ -32,7 +32,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Grid:
+class MapGrid:
     """Square cells on the ground, north up.
 
     Borders of cells lie at multiples of their size, so that maps with the same size of cells have the same grid.
@@ -54,7 +54,7 @@ class Grid:
     height: int
 
     @classmethod
-    def around(cls, turn: np.ndarray, gsd: float, bounds: tuple[float, float, float, float]) -> Grid:
+    def around(cls, turn: np.ndarray, gsd: float, bounds: tuple[float, float, float, float]) -> MapGrid:
         """The cells that cover bounds: least easting and northing, then greatest, units of the input.
 
         Raises:
@@ -65,9 +65,10 @@ class Grid:
             raise BadInput(f"bounds {shown(bounds)}: nothing lies within; give west south east north of the surface")
         left, low = math.floor(west), math.floor(south)
         width, height = max(1, math.ceil(east) - left), max(1, math.ceil(north) - low)
-        if width * height > MOST_CELLS:
+        if width * height > MAX_MAP_CELLS:
             raise BadInput(
-                f"--gsd: {width} x {height} cells of {gsd:g} are too many for one map (at most {MOST_CELLS:.0e}); give "
+                f"--gsd: {width} x {height} cells of {gsd:g} are too many for one map (at most {MAX_MAP_CELLS:.0e}); "
+                f"give "
                 "a larger --gsd, or --bounds, if parts of the mesh lie far away"
             )
         return cls(turn, gsd, left, low + height, width, height)
@@ -141,9 +142,9 @@ def refuse_stretched(frame: Frame) -> None:
     told = (
         f"{frame.crs}: lengths on the map are {longer:.4g} times those on the ground here, areas {longer**2:.4g} times"
     )
-    if abs(longer - 1) > TOO_STRETCHED:
+    if abs(longer - 1) > MAX_SCALE_ERROR:
         raise BadInput(f"{told}; convert the cameras to a system that keeps lengths, such as UTM")
-    if abs(longer - 1) > STRETCHED:
+    if abs(longer - 1) > QUIET_SCALE_ERROR:
         emit(Warned(f"{told}; cells, areas and volumes are those of the map"))
 
 

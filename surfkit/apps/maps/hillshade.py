@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from surfkit.apps.maps.geotiff import Sheet
+from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.grid import Window
 from surfkit.apps.maps.rasters import NODATA, window_of
 from surfkit.core.events import Progress, emit
 
-AZIMUTH, ALTITUDE = 315.0, 45.0
+LIGHT_AZIMUTH_DEGREES, LIGHT_ALTITUDE_DEGREES = 315.0, 45.0
 """Degrees: the light comes from the north-west, as maps have it."""
 
 
-def draw_hillshade(sheet: Sheet, heights: str, name: str, side: int) -> None:
+def draw_hillshade(sheet: GeoTiffSettings, heights: str, name: str, side: int) -> None:
     """Write the hillshade of a surface model of `sheet.out`, in tiles of so many cells."""
     import rasterio
 
@@ -36,7 +36,7 @@ def hillshade(heights: np.ndarray, gsd: float) -> np.ndarray:
     columns = columns + heights[:, 2:]
     east = (rows[:, 2:] - rows[:, :-2]) / (8 * gsd)
     north = (columns[:-2] - columns[2:]) / (8 * gsd)
-    azimuth, altitude = math.radians(AZIMUTH), math.radians(ALTITUDE)
+    azimuth, altitude = math.radians(LIGHT_AZIMUTH_DEGREES), math.radians(LIGHT_ALTITUDE_DEGREES)
     flat = math.cos(altitude)
     light = math.sin(altitude) - flat * (east * math.sin(azimuth) + north * math.cos(azimuth))
     share = (light / np.sqrt(1 + east**2 + north**2)).clip(0) + 0 * heights[1:-1, 1:-1]

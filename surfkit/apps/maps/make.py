@@ -12,14 +12,14 @@ import numpy as np
 from surfkit.apps.maps.cloud import write_cloud
 from surfkit.apps.maps.contours import even_interval, write_contours
 from surfkit.apps.maps.difference import Difference, draw_difference, write_difference
-from surfkit.apps.maps.geotiff import Sheet, workshop
-from surfkit.apps.maps.grid import Grid, map_crs, shown
+from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
+from surfkit.apps.maps.grid import MapGrid, map_crs, shown
 from surfkit.apps.maps.hillshade import draw_hillshade
-from surfkit.apps.maps.ours import FILES, RECORD, claim, own_files
-from surfkit.apps.maps.photographs import FromPhotographs
-from surfkit.apps.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
-from surfkit.apps.texture.keep import Kept, identity, seen
-from surfkit.apps.texture.make import Subject, TextureSettings, textured
+from surfkit.apps.maps.ours import MAPS_RECORD, PRODUCT_FILES, claim, own_files
+from surfkit.apps.maps.photographs import OrthophotoColors
+from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
+from surfkit.apps.texture.keep import TextureCache, identity, seen
+from surfkit.apps.texture.make import MeshWithPhotos, TextureSettings, textured
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
@@ -27,7 +27,7 @@ from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.core.optional import needed
 from surfkit.core.stages import key_of
 from surfkit.core.version import own_version
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
@@ -36,9 +36,9 @@ from surfkit.scene.up_direction import map_axes, up_direction
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
-COMPARED = ("other", "difference", "picture")
+COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
-PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
+PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 """What products need beside rasterio."""
 
 
@@ -98,14 +98,16 @@ class MapSettings:
     def refuse_missing(self) -> None:
         """BadInput if a package is missing, before anything is done."""
         for name in self.names:
-            for package in ("rasterio", *PACKAGES.get(name, ())):
+            for package in ("rasterio", *PRODUCT_PACKAGES.get(name, ())):
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
         if self.colors == "photographs":
             require_simplification("simplifying a mesh")
 
 
-def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface | None = None) -> dict[str, Any]:
+def make_maps(
+    subject: MeshWithPhotos, settings: MapSettings, out: Path, other: SurfaceFile | None = None
+) -> dict[str, Any]:
     """Write the maps of a mesh into a folder, and return what maps.json says: lengths are in units of the input.
 
     Args:
@@ -129,18 +131,18 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     if other is not None:
         refuse_apart(other, grid)
     done, unit = drawable(surface, settings), unit_of(frame)
-    files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
+    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()))]
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
         seen(subject.views) if settings.colors == "photographs" else "",
     )  # fmt: skip
-    with workshop(out, (*files, RECORD), key) as folder:
-        replaced = (RECORD, *sorted(own_files(out) - {*files, RECORD}))
-        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid), replaced)
-        drawn = Drawn(**sheet.once(
-            [FILES[name] for name in ("dsm", "orthophoto") if name in done],
-            lambda: asdict(draw(subject, settings, sheet, FILES["orthophoto"] in files)),
+    with workshop(out, (*files, MAPS_RECORD), key) as folder:
+        replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
+        sheet = GeoTiffSettings(grid, crs, folder, out, needs_double(surface, grid), replaced)
+        drawn = SurfaceModelStats(**sheet.once(
+            [PRODUCT_FILES[name] for name in ("dsm", "orthophoto") if name in done],
+            lambda: asdict(draw(subject, settings, sheet, PRODUCT_FILES["orthophoto"] in files)),
         ))  # fmt: skip
         record = {
             "mesh": str(surface.path),
@@ -162,33 +164,33 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         if other is not None:
             record["difference"] = subtract(sheet, other, settings.tile, unit)
         record["files"] = files
-        write_json(out / RECORD, record)
-        emit(FileWritten(out / RECORD, "facts of the maps"))
+        write_json(out / MAPS_RECORD, record)
+        emit(FileWritten(out / MAPS_RECORD, "facts of the maps"))
     return record
 
 
-def draw(subject: Subject, settings: MapSettings, sheet: Sheet, colored: bool) -> Drawn:
+def draw(subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool) -> SurfaceModelStats:
     """Draw the surface model, and the orthophoto if it is wanted."""
     photographs = None
     if colored and settings.colors == "photographs":
         texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
-        made = textured(subject, TextureSettings(texel=texel), budget, Kept(sheet.folder))
-        photographs = FromPhotographs(made, subject.frame, sheet, settings.tile)
-    colors = FILES["orthophoto"] if colored else None
-    return draw_surface(subject.surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
+        made = textured(subject, TextureSettings(texel=texel), budget, TextureCache(sheet.folder))
+        photographs = OrthophotoColors(made, subject.frame, sheet, settings.tile)
+    colors = PRODUCT_FILES["orthophoto"] if colored else None
+    return draw_surface(subject.surface, sheet, settings.tile, PRODUCT_FILES["dsm"], colors, photographs)
 
 
-def grid_of(subject: Subject, settings: MapSettings, turn: np.ndarray) -> Grid:
+def grid_of(subject: MeshWithPhotos, settings: MapSettings, turn: np.ndarray) -> MapGrid:
     """The cells of the maps; `turn` is (3, 3), from the frame of the input to east, north and up."""
     frame, surface = subject.frame, subject.surface
     if settings.gsd == "auto":
         gsd = ground_sampling_distance(surface, subject.views, frame)
     else:
         gsd = settings.gsd / (frame.metres or 1.0)
-    return Grid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+    return MapGrid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
 
 
-def refuse_apart(surface: Surface, grid: Grid) -> None:
+def refuse_apart(surface: SurfaceFile, grid: MapGrid) -> None:
     """BadInput for a mesh that lies beside the cells, before maps that are there are replaced."""
     west, south, east, north = found = bounds_of(surface, grid.turn)
     borders = grid.bounds
@@ -199,7 +201,7 @@ def refuse_apart(surface: Surface, grid: Grid) -> None:
         )
 
 
-def drawable(surface: Surface, settings: MapSettings) -> tuple[str, ...]:
+def drawable(surface: SurfaceFile, settings: MapSettings) -> tuple[str, ...]:
     """Names of the products, but for an orthophoto that would have no colours, which a warning tells."""
     if "orthophoto" not in settings.names or settings.colors == "photographs" or has_colors(surface):
         return settings.names
@@ -208,54 +210,58 @@ def drawable(surface: Surface, settings: MapSettings) -> tuple[str, ...]:
 
 
 def draw_products(
-    subject: Subject, settings: MapSettings, sheet: Sheet, drawn: Drawn, done: Sequence[str]
+    subject: MeshWithPhotos,
+    settings: MapSettings,
+    sheet: GeoTiffSettings,
+    drawn: SurfaceModelStats,
+    done: Sequence[str],
 ) -> dict[str, Any]:
     """Draw what follows from the surface model, and return what maps.json says of it."""
     record: dict[str, Any] = {}
     units = subject.frame.metres or 1.0
     if "hillshade" in done:
-        sheet.once([FILES["hillshade"]], lambda: shade(sheet, settings.tile))
+        sheet.once([PRODUCT_FILES["hillshade"]], lambda: shade(sheet, settings.tile))
     if "contours" in done:
         given = settings.interval
         interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
-        record["contours"] = sheet.once([FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
+        record["contours"] = sheet.once([PRODUCT_FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
     if "points" in done:
         spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
-        record["points"] = sheet.once([FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
+        record["points"] = sheet.once([PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
     return record
 
 
-def shade(sheet: Sheet, side: int) -> dict[str, Any]:
+def shade(sheet: GeoTiffSettings, side: int) -> dict[str, Any]:
     """Draw the hillshade; there is nothing to tell of it."""
-    draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], side)
+    draw_hillshade(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["hillshade"], side)
     return {}
 
 
-def trace(sheet: Sheet, interval: float, side: int) -> dict[str, Any]:
+def trace(sheet: GeoTiffSettings, interval: float, side: int) -> dict[str, Any]:
     """Write the contour lines, and return what maps.json says of them."""
     return {
         "interval": interval,
-        "lines": write_contours(sheet, FILES["dsm"], FILES["contours"], interval, side),
+        "lines": write_contours(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["contours"], interval, side),
     }
 
 
-def scatter(surface: Surface, sheet: Sheet, spacing: float) -> dict[str, Any]:
+def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float) -> dict[str, Any]:
     """Write the point cloud, and return what maps.json says of it."""
-    return {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
+    return {"spacing": spacing, "points": write_cloud(surface, sheet, PRODUCT_FILES["points"], spacing)}
 
 
-def subtract(sheet: Sheet, other: Surface, side: int, unit: str) -> dict[str, Any]:
+def subtract(sheet: GeoTiffSettings, other: SurfaceFile, side: int, unit: str) -> dict[str, Any]:
     """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
-    sheet.once([FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, FILES["other"])))
-    heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
-    name = FILES["difference"]
+    sheet.once([PRODUCT_FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, PRODUCT_FILES["other"])))
+    heights = sheet.out / PRODUCT_FILES["dsm"], sheet.out / PRODUCT_FILES["other"]
+    name = PRODUCT_FILES["difference"]
     found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
-    claim(sheet.out, FILES["picture"])
-    draw_difference(sheet.out / FILES["picture"], sheet.out / name, found, unit)
+    claim(sheet.out, PRODUCT_FILES["picture"])
+    draw_difference(sheet.out / PRODUCT_FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}
 
 
-def bounds_of(surface: Surface, turn: np.ndarray) -> tuple[float, float, float, float]:
+def bounds_of(surface: SurfaceFile, turn: np.ndarray) -> tuple[float, float, float, float]:
     """West, south, east and north of the vertices of a mesh."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for block in surface.blocks():

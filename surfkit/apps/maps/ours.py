@@ -10,34 +10,34 @@ from typing import Any
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
-from surfkit.core.stages import KEY, delete_parts
+from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 
-FILES = {
+PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
 }  # fmt: skip
-RECORD = "maps.json"
+MAPS_RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""
-WORK = "unfinished"
+UNFINISHED_FOLDER = "unfinished"
 """Folder for what is finished of maps, in theirs."""
-NAMES = "names.json"
+NAMES_FILE = "names.json"
 """In that folder: which files in theirs are ours."""
 
 
 def own_files(out: Path) -> set[str]:
     """Names of the files in a folder that earlier calls wrote: whole maps, or what an interrupted one finished."""
-    known, found = {*FILES.values()}, set()
-    record = _read(out / RECORD)
+    known, found = {*PRODUCT_FILES.values()}, set()
+    record = _read(out / MAPS_RECORD)
     if "gsd" in record and isinstance(record.get("files"), list):
-        found = {RECORD, *(known & {*map(str, record["files"])})}
-    if (out / WORK / KEY).is_file():  # versions before this one kept no names
-        found |= known & {*_read(out / WORK / NAMES).get("names", known)}
+        found = {MAPS_RECORD, *(known & {*map(str, record["files"])})}
+    if (out / UNFINISHED_FOLDER / UNFINISHED_FILE).is_file():  # versions before this one kept no names
+        found |= known & {*_read(out / UNFINISHED_FOLDER / NAMES_FILE).get("names", known)}
     return found
 
 
 def keep_names(out: Path, names: Iterable[str]) -> None:
     """Note in the folder for unfinished maps which files are ours."""
-    write_json(out / WORK / NAMES, {"names": sorted({*names} - {RECORD})})
+    write_json(out / UNFINISHED_FOLDER / NAMES_FILE, {"names": sorted({*names} - {MAPS_RECORD})})
 
 
 def claim(out: Path, name: str) -> None:
@@ -47,10 +47,10 @@ def claim(out: Path, name: str) -> None:
 
 def forget_unfinished(out: Path) -> None:
     """Delete what is finished of maps that will not be whole."""
-    if not (out / RECORD).exists():
+    if not (out / MAPS_RECORD).exists():
         for name in own_files(out):
             (out / name).unlink(missing_ok=True)
-    delete_parts(out / WORK)
+    delete_parts(out / UNFINISHED_FOLDER)
 
 
 def refuse_foreign(out: Path, names: Iterable[str]) -> None:

@@ -6,22 +6,22 @@ import numpy as np
 import torch
 
 from surfkit.apps.maps.bins import corners_of, sort_faces
-from surfkit.apps.maps.geotiff import Sheet
-from surfkit.apps.maps.zbuffer import NONE, ZBuffer, barycentric
-from surfkit.apps.texture.deliver import Textured
+from surfkit.apps.maps.geotiff import GeoTiffSettings
+from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
+from surfkit.apps.texture.deliver import TexturedMesh
 from surfkit.apps.texture.exposure import exposed, levelled
 from surfkit.apps.texture.photographs import by_photograph
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.scene.scene import Frame
 
-NEAR = 3.0
+MAX_HEIGHT_OFFSET_CELLS = 3.0
 """Cells of height by which the textured mesh, which is simplified, may differ from the surface model, to be what is
 seen there."""
-CELLS = 1 << 20
+BATCH_CELLS = 1 << 20
 """Cells whose colour is computed at once."""
 
 
-class FromPhotographs:
+class OrthophotoColors:
     """Colours of cells that photographs show.
 
     Args:
@@ -31,10 +31,10 @@ class FromPhotographs:
         side: Of a tile, cells.
     """
 
-    def __init__(self, made: Textured, frame: Frame, sheet: Sheet, side: int) -> None:
+    def __init__(self, made: TexturedMesh, frame: Frame, sheet: GeoTiffSettings, side: int) -> None:
         self.paint = made.paint
         mesh = made.paint.mesh
-        surface = Surface(sheet.out / "textured", frame.to_input(mesh.vertices), mesh.faces)
+        surface = SurfaceFile(sheet.out / "textured", frame.to_input(mesh.vertices), mesh.faces)
         self.bins = sort_faces(surface, sheet.grid, side, sheet.folder / "faces-textured")
 
     def over(self, tile: int, buffer: ZBuffer, image: np.ndarray) -> int:
@@ -49,14 +49,14 @@ class FromPhotographs:
         for numbers in self.bins.of(tile):
             ours.draw(corners_of(self.bins.surface, self.bins.grid, numbers), numbers)
         with np.errstate(invalid="ignore"):
-            near = np.abs(ours.height - buffer.height) <= NEAR * self.bins.grid.gsd
-        cells = np.flatnonzero(near & (ours.face != NONE) & (buffer.face != NONE))
+            near = np.abs(ours.height - buffer.height) <= MAX_HEIGHT_OFFSET_CELLS * self.bins.grid.gsd
+        cells = np.flatnonzero(near & (ours.face != NO_TRIANGLE) & (buffer.face != NO_TRIANGLE))
         face = ours.face.reshape(-1)[cells]
         parts = by_photograph(self.paint.atlas.view[face])
         self.paint.photos.expect([number for number, _ in parts])
         for number, some in parts:
-            for at in range(0, len(some), CELLS):
-                rows = some[at : at + CELLS]
+            for at in range(0, len(some), BATCH_CELLS):
+                rows = some[at : at + BATCH_CELLS]
                 image.reshape(4, -1)[:3, cells[rows]] = self._colors(number, buffer, cells[rows], face[rows]).T
         return sum(len(some) for _, some in parts)
 

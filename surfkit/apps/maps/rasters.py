@@ -10,17 +10,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.grid import MapGrid, Window
 from surfkit.core.codec import from_json
 from surfkit.core.files import replacing
 
-BLOCK = 512
+TILE_SIDE_CELLS = 512
 """Side of the tiles within a file, cells."""
 NODATA = -9999.0
 """Height where there is no surface."""
 Kind = Literal["heights", "colors", "shades"]
 CHANNELS = {"heights": ("Gray",), "colors": ("Red", "Green", "Blue", "Alpha"), "shades": ("Gray",)}
-FACTS = "surfkit"
+FACTS_TAG = "surfkit"
 """Tag of a tile for what was counted when it was drawn."""
 
 
@@ -37,7 +37,7 @@ class Raster:
     """
 
     folder: Path
-    grid: Grid
+    grid: MapGrid
     crs: Any
     kind: Kind
     double: bool
@@ -68,8 +68,8 @@ class Raster:
         image = image.reshape(-1, window.height, window.width).astype(self.dtype, copy=False)
         inner = {
             "tiled": True,
-            "blockxsize": BLOCK,
-            "blockysize": BLOCK,
+            "blockxsize": TILE_SIDE_CELLS,
+            "blockysize": TILE_SIDE_CELLS,
             "compress": "LZW",
             "interleave": "band",
             "nodata": self.nodata,
@@ -78,7 +78,7 @@ class Raster:
         with MemoryFile() as memory:
             with memory.open(driver="GTiff", **place, **size, **inner) as file:
                 file.write(image)
-                file.update_tags(**{FACTS: json.dumps(facts)})
+                file.update_tags(**{FACTS_TAG: json.dumps(facts)})
             with replacing(self._file(window)) as file:
                 file.write(memory.getbuffer())
 
@@ -89,7 +89,7 @@ class Raster:
         if not self._file(window).exists():
             return None
         with rasterio.open(self._file(window)) as file:
-            return from_json(file.tags()[FACTS])
+            return from_json(file.tags()[FACTS_TAG])
 
     def whole(self) -> Path:
         """Write the file that joins the tiles that are there, and return its path."""
@@ -113,7 +113,7 @@ class Raster:
                 ElementTree.SubElement(source, "SourceBand").text = str(channel)
                 size = {"xSize": str(width), "ySize": str(height)}
                 facts = {"RasterXSize": str(width), "RasterYSize": str(height), "DataType": kind}
-                block = {"BlockXSize": str(BLOCK), "BlockYSize": str(BLOCK)}
+                block = {"BlockXSize": str(TILE_SIDE_CELLS), "BlockYSize": str(TILE_SIDE_CELLS)}
                 ElementTree.SubElement(source, "SourceProperties", **facts, **block)
                 ElementTree.SubElement(source, "SrcRect", xOff="0", yOff="0", **size)
                 ElementTree.SubElement(source, "DstRect", xOff=str(left), yOff=str(top), **size)

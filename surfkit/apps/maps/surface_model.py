@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.maps.bins import Bins, corners_of, sort_faces
-from surfkit.apps.maps.geotiff import Sheet
-from surfkit.apps.maps.grid import Grid, Window
-from surfkit.apps.maps.photographs import FromPhotographs
+from surfkit.apps.maps.geotiff import GeoTiffSettings
+from surfkit.apps.maps.grid import MapGrid, Window
+from surfkit.apps.maps.photographs import OrthophotoColors
 from surfkit.apps.maps.rasters import NODATA
-from surfkit.apps.maps.zbuffer import NONE, ZBuffer, barycentric
+from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 
-CELLS = 1 << 20
+BATCH_CELLS = 1 << 20
 """Cells whose colour is computed at once."""
-GREY = 128
+UNSEEN_GREY = 128
 """Of what no photograph shows, if the mesh has no colours."""
-COLORS = ("red", "green", "blue")
+COLOR_CHANNELS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SurfaceModelStats:
     """What was drawn.
 
     Attributes:
@@ -43,19 +43,19 @@ class Drawn:
     from_photographs: int = 0
 
 
-def has_colors(surface: Surface) -> bool:
+def has_colors(surface: SurfaceFile) -> bool:
     """Whether the vertices of a mesh have colours."""
-    return set(COLORS) <= set(surface.rows.dtype.names or ())
+    return set(COLOR_CHANNELS) <= set(surface.rows.dtype.names or ())
 
 
 def draw_surface(
-    surface: Surface,
-    sheet: Sheet,
+    surface: SurfaceFile,
+    sheet: GeoTiffSettings,
     side: int,
     heights: str,
     colors: str | None = None,
-    photographs: FromPhotographs | None = None,
-) -> Drawn:
+    photographs: OrthophotoColors | None = None,
+) -> SurfaceModelStats:
     """Write the surface model, and the orthophoto, of a mesh.
 
     Args:
@@ -90,7 +90,7 @@ def draw_surface(
                 f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
                 "smaller --gsd, or other --bounds"
             )
-    return Drawn(
+    return SurfaceModelStats(
         sum(facts["covered"] for facts in found),
         min(facts["lowest"] for facts in found),
         max(facts["highest"] for facts in found),
@@ -117,16 +117,16 @@ def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
     they have none), and 255; 0 0 0 0 where there is no triangle."""
     window, faces = buffer.window, buffer.face.reshape(-1)
     image, colored = np.zeros((4, faces.size), np.uint8), has_colors(bins.surface)
-    seen = np.flatnonzero(faces != NONE)
-    for at in range(0, len(seen), CELLS):
-        cells = seen[at : at + CELLS]
+    seen = np.flatnonzero(faces != NO_TRIANGLE)
+    for at in range(0, len(seen), BATCH_CELLS):
+        cells = seen[at : at + BATCH_CELLS]
         used, owner = np.unique(faces[cells], return_inverse=True)
         row, column = np.divmod(cells, window.width)
         places = column + window.left + 0.5, row + window.top + 0.5
         inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
         rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
-        for channel, name in enumerate(COLORS):
-            values = rows[name] if colored else np.full(len(rows), GREY)
+        for channel, name in enumerate(COLOR_CHANNELS):
+            values = rows[name] if colored else np.full(len(rows), UNSEEN_GREY)
             a, b, c = values.reshape(-1, 3).T.astype(np.float64)
             found = a[owner] + second * (b - a)[owner] + third * (c - a)[owner]
             image[channel, cells[inside]] = np.rint(found).astype(np.uint8)
@@ -134,7 +134,7 @@ def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
     return image.reshape(4, *buffer.face.shape)
 
 
-def needs_double(surface: Surface, grid: Grid) -> bool:
+def needs_double(surface: SurfaceFile, grid: MapGrid) -> bool:
     """Whether heights of a mesh, in 32 bits, would be coarser than a hundredth of a cell."""
     highest = max((float(np.abs(grid.to_map(block)[:, 2]).max(initial=0)) for block in surface.blocks()), default=0.0)
     return float(np.spacing(np.float32(highest))) > grid.gsd / 100

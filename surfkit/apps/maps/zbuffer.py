@@ -11,9 +11,9 @@ import numpy as np
 
 from surfkit.apps.maps.grid import Window
 
-AT_ONCE = 1 << 22
+BATCH_TRIANGLE_CELLS = 1 << 22
 """Pairs of a triangle and a cell in its bounding box in memory."""
-NONE = -1
+NO_TRIANGLE = -1
 
 
 class ZBuffer:
@@ -27,12 +27,12 @@ class ZBuffer:
     def __init__(self, window: Window) -> None:
         self.window = window
         self.height = np.full((window.height, window.width), -np.inf)
-        self.face = np.full((window.height, window.width), NONE, np.int64)
+        self.face = np.full((window.height, window.width), NO_TRIANGLE, np.int64)
 
     @property
     def covered(self) -> np.ndarray:
         """(H, W) bool: where there is a triangle."""
-        return self.face != NONE
+        return self.face != NO_TRIANGLE
 
     def draw(self, corners: np.ndarray, numbers: np.ndarray) -> None:
         """Draw triangles.
@@ -47,7 +47,9 @@ class ZBuffer:
         ends = np.cumsum(size[shown])
         first = 0
         while first < len(shown):
-            last = max(first + 1, int(np.searchsorted(ends, (ends[first - 1] if first else 0) + AT_ONCE, "right")))
+            last = max(
+                first + 1, int(np.searchsorted(ends, (ends[first - 1] if first else 0) + BATCH_TRIANGLE_CELLS, "right"))
+            )
             some = shown[first:last]
             if last == first + 1:  # may be larger than what fits
                 self._one(corners[some], low[some], high[some], numbers[some])
@@ -57,7 +59,7 @@ class ZBuffer:
 
     def _one(self, corners: np.ndarray, low: np.ndarray, high: np.ndarray, number: np.ndarray) -> None:
         """Draw a triangle of any size, some rows at a time."""
-        step = max(1, AT_ONCE // int(high[0, 0] - low[0, 0]))
+        step = max(1, BATCH_TRIANGLE_CELLS // int(high[0, 0] - low[0, 0]))
         for row in range(low[0, 1], high[0, 1], step):
             below = np.array([[high[0, 0], min(row + step, high[0, 1])]])
             self._pairs(corners, np.array([[low[0, 0], row]]), below, number)

@@ -14,7 +14,7 @@ from surfkit.apps.new.write import Template, template_of, write_package
 
 
 @dataclass(frozen=True)
-class NewPlugin:
+class NewPluginCommand:
     """Write the files of a new plugin: an installable package with one working part of a chosen kind, its tests and,
     where the part belongs into a recipe, a recipe and an ablation table.
 
@@ -40,7 +40,7 @@ class NewPlugin:
         print(_next(out, names, template))
 
 
-COMMAND = {"plugin": NewPlugin}
+COMMAND = {"plugin": NewPluginCommand}
 
 
 def _next(out: Path, names: Names, template: Template) -> str:

@@ -16,7 +16,7 @@ from surfkit.core.registry import offered, records
 
 PREFIX = "surfkit-"
 KEBAB = r"[a-z][a-z0-9]*(-[a-z0-9]+)*"
-LONGEST = 60
+MAX_NAME_LETTERS = 60
 """Letters of a name."""
 
 
@@ -59,10 +59,10 @@ def checked_names(package: str, kind: str, template: Template) -> Names:
     Raises:
         BadInput: The package cannot be called so.
     """
-    if not re.fullmatch(KEBAB, package) or len(package) > LONGEST:
+    if not re.fullmatch(KEBAB, package) or len(package) > MAX_NAME_LETTERS:
         raise BadInput(
             f"{package!r} is not a package name in kebab-case (lower-case letters, digits, single hyphens, a letter "
-            f"first, {LONGEST} characters at most); give one such as {PREFIX}oversized"
+            f"first, {MAX_NAME_LETTERS} characters at most); give one such as {PREFIX}oversized"
         )
     names = Names(package, kind)
     if not names.part or not names.identifier.isidentifier() or keyword.iskeyword(names.identifier):

@@ -23,8 +23,8 @@ from surfkit.core.registry import unknown
 if TYPE_CHECKING:
     from surfkit.apps.new.names import Names
 
-TEMPLATES = Path(__file__).parent / "templates"
-COMMON = TEMPLATES / "common"
+TEMPLATES_FOLDER = Path(__file__).parent / "templates"
+COMMON = TEMPLATES_FOLDER / "common"
 COMMAND = "command"
 """What a package can offer beside components."""
 
@@ -66,7 +66,7 @@ class Template:
 
 def kinds() -> list[str]:
     """The kinds that have a template."""
-    return sorted(folder.name for folder in TEMPLATES.iterdir() if (folder / "part.py").is_file())
+    return sorted(folder.name for folder in TEMPLATES_FOLDER.iterdir() if (folder / "part.py").is_file())
 
 
 def template_of(kind: str) -> Template:
@@ -83,7 +83,7 @@ def template_of(kind: str) -> Template:
             f"no template for the kind {kind!r}; those with one are {', '.join(kinds())}; docs/kinds.md shows what a "
             f"{kind} must write, to replace the part of another kind with"
         )
-    folder = TEMPLATES / kind
+    folder = TEMPLATES_FOLDER / kind
     part, test = _text(folder / "part.py"), _text(folder / "test.py")
     common = COMMON / ("init.py" if "\nCHANGE: " in part else "alone.py")
     init = _text(folder / "init.py" if (folder / "init.py").is_file() else common)

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.apps.render.frames import Show, draw_frames, identity
-from surfkit.apps.render.path import LONGEST, MOST_FRAMES, Flight, flyover, from_file, lens_of, orbit
+from surfkit.apps.render.path import MAX_FRAMES, MAX_SIDE_PX, CameraPath, flyover, from_file, lens_of, orbit
 from surfkit.apps.render.video import Film, is_video, make_video, require_video
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
@@ -24,13 +24,13 @@ from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
 
-SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+SIZE_PATTERN = re.compile(r"(\d{1,5})x(\d{1,5})")
 FPS = 30.0
-MADE: dict[str, Callable[[Scene, Camera, int], Flight]] = {"orbit": orbit, "flyover": flyover}
+MADE_PATHS: dict[str, Callable[[Scene, Camera, int], CameraPath]] = {"orbit": orbit, "flyover": flyover}
 
 
 @dataclass(frozen=True)
-class Render:
+class RenderCommand:
     """Draw a finished run along a path of the camera, as a video or as pictures.
 
     Example: `surfkit render RUN --path orbit --out orbit.mp4 --seconds 20 --size 1920x1080`. When it is interrupted,
@@ -73,11 +73,13 @@ class Render:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if value is not None and not 0 < value <= 1e6:
                 raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
-        if self.frames > MOST_FRAMES:
-            raise BadInput(f"--seconds {self.seconds:g}: that is {self.frames} frames; at most {MOST_FRAMES} are drawn")
+        if self.frames > MAX_FRAMES:
+            raise BadInput(f"--seconds {self.seconds:g}: that is {self.frames} frames; at most {MAX_FRAMES} are drawn")
         self.sides()
-        if self.path not in MADE and not Path(self.path).is_file():
-            raise BadInput(f"--path {self.path}: no such file; give {', '.join(MADE)} or a JSON file with cameras")
+        if self.path not in MADE_PATHS and not Path(self.path).is_file():
+            raise BadInput(
+                f"--path {self.path}: no such file; give {', '.join(MADE_PATHS)} or a JSON file with cameras"
+            )
         if self.out is not None and self.out.suffix and not is_video(self.out):
             raise BadInput(f"--out {self.out}: give a video, .mp4 or .webm, or a folder for pictures")
 
@@ -90,15 +92,17 @@ class Render:
         """Width and height in pixels; BadInput if `size` is none."""
         if self.size is None:
             return None
-        found = SIZE.fullmatch(self.size)
+        found = SIZE_PATTERN.fullmatch(self.size)
         sides = tuple(map(int, found.groups())) if found else (0, 0)
-        if not all(16 <= side <= LONGEST for side in sides):
-            raise BadInput(f"--size {self.size}: give width and height such as 1920x1080, of 16 to {LONGEST} pixels")
+        if not all(16 <= side <= MAX_SIDE_PX for side in sides):
+            raise BadInput(
+                f"--size {self.size}: give width and height such as 1920x1080, of 16 to {MAX_SIDE_PX} pixels"
+            )
         return sides[0], sides[1]
 
     def run(self) -> None:
         """Draw the frames, make the video, and print what was written."""
-        name = self.path if self.path in MADE else Path(self.path).stem
+        name = self.path if self.path in MADE_PATHS else Path(self.path).stem
         out = self.out or self.run_folder / f"{name}.mp4"
         film = is_video(out)
         if film:
@@ -126,12 +130,12 @@ class Render:
             ],
         )
 
-    def flight(self, scene: Scene) -> Flight:
+    def flight(self, scene: Scene) -> CameraPath:
         """The cameras of all frames."""
         lens = lens_of(scene, self.sides())
-        if self.path in MADE:
-            return MADE[self.path](scene, lens, self.frames)
+        if self.path in MADE_PATHS:
+            return MADE_PATHS[self.path](scene, lens, self.frames)
         return from_file(Path(self.path), scene.frame, lens, self.frames)
 
 
-COMMAND = Render
+COMMAND = RenderCommand

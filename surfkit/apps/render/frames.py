@@ -15,14 +15,14 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.core.lock import NAME as LOCK
+from surfkit.core.lock import LOCK_FILE as LOCK
 from surfkit.evaluate.images.pictures import colour_depth, colour_normal, write_picture
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
 Show = Literal["color", "depth", "normal"]
-RECORD = "frames.json"
+FRAMES_RECORD = "frames.json"
 """What the pictures of a folder show: what was drawn, and from which cameras."""
 WRITTEN_AHEAD = 4
 """Pictures that are compressed while the next ones are drawn."""
@@ -82,7 +82,7 @@ def draw_frames(
 
 def claim(folder: Path, shows: str, replace: bool) -> None:
     """Take a folder for these pictures; BadInput if it has anything else in it."""
-    record = folder / RECORD
+    record = folder / FRAMES_RECORD
     if record.exists():
         if read_json(record, dict[str, str]).get("shows") == shows:
             return
@@ -95,7 +95,9 @@ def claim(folder: Path, shows: str, replace: bool) -> None:
         for frame in folder.glob("[0-9]" * 6 + ".png"):
             frame.unlink()
     elif any(path.name != LOCK for path in folder.iterdir()):
-        raise BadInput(f"{folder}: it has files but no {RECORD}, so frames are not written into it; give another --out")
+        raise BadInput(
+            f"{folder}: it has files but no {FRAMES_RECORD}, so frames are not written into it; give another --out"
+        )
     write_json(record, {"shows": shows})
 
 

@@ -19,22 +19,22 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.scene.up_direction import up_direction
 
-FROM, TO = 0.05, 0.95
+START_QUANTILE, END_QUANTILE = 0.05, 0.95
 """Where a flight over the scene begins and ends: quantiles of the camera positions along it."""
 PITCH_DEGREES = 45.0
 """By which the camera looks down in a flight over the scene."""
-LOW = 0.05
+LOW_HEIGHT_SHARE = 0.05
 """Height of the cameras above what they see, as a share of the length of the flight, below which they stand on the
 ground and look ahead."""
-LONGEST = 16384
+MAX_SIDE_PX = 16384
 """Most pixels along a side of a picture."""
-MOST_FRAMES = 1_000_000
+MAX_FRAMES = 1_000_000
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Axes of nerfstudio's cameras (y up, z backward) in those of ours."""
 
 
 @dataclass(frozen=True)
-class Flight:
+class CameraPath:
     """A path of the camera.
 
     Attributes:
@@ -46,7 +46,7 @@ class Flight:
     fps: float | None = None
 
 
-def orbit(scene: Scene, lens: Camera, count: int) -> Flight:
+def orbit(scene: Scene, lens: Camera, count: int) -> CameraPath:
     """A circle around the middle of the scene, to which the camera looks.
 
     Its height is the median of the training cameras above the middle, and its radius their median distance from the
@@ -63,10 +63,10 @@ def orbit(scene: Scene, lens: Camera, count: int) -> Flight:
     for angle in 2 * math.pi * np.arange(count) / count:
         at = middle + radius * (math.cos(angle) * east + math.sin(angle) * north) + height * up
         cameras.append(looking(lens, at, middle - at, up))
-    return Flight(cameras)
+    return CameraPath(cameras)
 
 
-def flyover(scene: Scene, lens: Camera, count: int) -> Flight:
+def flyover(scene: Scene, lens: Camera, count: int) -> CameraPath:
     """A straight flight along the direction in which the training cameras are spread most, at their median height.
 
     The camera looks ahead and down, and what it looks at moves from one end of the cameras to the other; where these
@@ -76,28 +76,28 @@ def flyover(scene: Scene, lens: Camera, count: int) -> Flight:
     level = centres - np.outer(centres @ up, up)
     along = np.linalg.svd(level - level.mean(0), full_matrices=False)[2][0]
     along *= 1.0 if along[np.abs(along).argmax()] > 0 else -1.0
-    begin, end = np.quantile(level @ along, [FROM, TO])
+    begin, end = np.quantile(level @ along, [START_QUANTILE, END_QUANTILE])
     if not end - begin > 0:
         raise BadInput("--path flyover: all training cameras stand above one place; give --path orbit or a file")
     across = np.cross(up, along)
     height = float(np.median(centres @ up))
     above = height - float(middle @ up)
-    pitch = math.radians(PITCH_DEGREES) if above > LOW * (end - begin) else 0.0
+    pitch = math.radians(PITCH_DEGREES) if above > LOW_HEIGHT_SHARE * (end - begin) else 0.0
     ahead = math.cos(pitch) * along - math.sin(pitch) * up
     behind = above / math.tan(pitch) if pitch else 0.0
     start = float(np.median(level @ across)) * across + height * up - behind * along
     steps = np.linspace(begin, end, count)
-    return Flight([looking(lens, start + step * along, ahead, up) for step in steps])
+    return CameraPath([looking(lens, start + step * along, ahead, up) for step in steps])
 
 
-def through(keys: Sequence[Camera], lens: Camera, count: int) -> Flight:
+def through(keys: Sequence[Camera], lens: Camera, count: int) -> CameraPath:
     """A smooth path through given cameras, with equal speed between two of them that are equally far apart.
 
     Positions follow a cubic spline and directions one of rotations (scipy's RotationSpline), both without a jump in
     speed; several cameras in one place are turned through one after another.
     """
     if len(keys) == 1:
-        return Flight([with_lens(lens, keys[0].world_to_camera)] * count)
+        return CameraPath([with_lens(lens, keys[0].world_to_camera)] * count)
     poses = np.stack([camera.world_to_camera.numpy() for camera in keys])
     turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1))
     centres = np.stack([camera.centre.numpy() for camera in keys])
@@ -108,10 +108,10 @@ def through(keys: Sequence[Camera], lens: Camera, count: int) -> Flight:
     times = np.concatenate([[0.0], np.cumsum(length)])
     at = np.linspace(0, times[-1], count)
     positions, directions = CubicSpline(times, centres)(at), RotationSpline(times, turns)(at).as_matrix()
-    return Flight([posed(lens, place, turn.T) for place, turn in zip(positions, directions, strict=True)])
+    return CameraPath([posed(lens, place, turn.T) for place, turn in zip(positions, directions, strict=True)])
 
 
-def from_file(path: Path, frame: Frame, lens: Camera, count: int) -> Flight:
+def from_file(path: Path, frame: Frame, lens: Camera, count: int) -> CameraPath:
     """The cameras of a JSON file, in the frame of the data set.
 
     That of 3DGS viewers, as RUN/cameras.json, has cameras to fly through; a camera path of nerfstudio has one camera
@@ -123,12 +123,12 @@ def from_file(path: Path, frame: Frame, lens: Camera, count: int) -> Flight:
     data = read_json(path, Any)
     if isinstance(data, dict) and isinstance(data.get("camera_path"), list) and data["camera_path"]:
         frames = data["camera_path"]
-        if len(frames) > MOST_FRAMES:
-            raise BadInput(f"{path}: it has {len(frames)} cameras; at most {MOST_FRAMES} frames are rendered")
+        if len(frames) > MAX_FRAMES:
+            raise BadInput(f"{path}: it has {len(frames)} cameras; at most {MAX_FRAMES} frames are rendered")
         rate = data.get("fps")
         known = isinstance(rate, (int, float)) and 0 < rate <= 1000
         found = [_of_nerfstudio(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(frames)]
-        return Flight(found, float(rate) if known else None)
+        return CameraPath(found, float(rate) if known else None)
     if isinstance(data, list) and data:
         keys = [_of_viewer(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(data)]
         return through(keys, lens, count)

@@ -14,27 +14,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.apps.report.elements import Chart, LegendEntry
+from surfkit.apps.report.elements import LegendEntry, LineChart
 
-INCHES = (5.6, 3.1)
-AXES = (0.13, 0.17, 0.84, 0.79)
+CHART_SIZE_INCHES = (5.6, 3.1)
+AXES_BOX = (0.13, 0.17, 0.84, 0.79)
 """Left, bottom, width and height of the axes, as shares of the drawing; page.css sets the cursor by it."""
-COLORS = 8
+LINE_COLOR_COUNT = 8
 """Lines with a colour of their own; further ones have other dashes."""
 DASHES: tuple[tuple[float, ...], ...] = ((), (6, 2), (2, 2), (8, 2, 2, 2))
-INK, GRID, LINE = "#fe0001", "#fe0002", "#fe01{:02x}"
+INK_PLACEHOLDER, GRID_PLACEHOLDER, LINE_PLACEHOLDER = "#fe0001", "#fe0002", "#fe01{:02x}"
 """Stand for variables of the page while matplotlib draws."""
 
 
 @dataclass(frozen=True)
-class Line:
+class ChartSeries:
     """A line of a chart: its name and (2, T) steps and values, T at least 2."""
 
     name: str
     dots: np.ndarray
 
 
-def chart(title: str, lines: Sequence[Line], x_label: str = "steps", top: float | None = None) -> Chart:
+def chart(title: str, lines: Sequence[ChartSeries], x_label: str = "steps", top: float | None = None) -> LineChart:
     """A chart of lines over the same axis; the vertical axis begins with 0.
 
     Args:
@@ -48,8 +48,8 @@ def chart(title: str, lines: Sequence[Line], x_label: str = "steps", top: float 
     entries = [
         LegendEntry(
             line.name,
-            at % COLORS,
-            " ".join(map(str, DASHES[at // COLORS % len(DASHES)])),
+            at % LINE_COLOR_COUNT,
+            " ".join(map(str, DASHES[at // LINE_COLOR_COUNT % len(DASHES)])),
             f"{_readable(line.dots[1][0])} to {_readable(line.dots[1][-1])}",
         )
         for at, line in enumerate(lines)
@@ -60,7 +60,7 @@ def chart(title: str, lines: Sequence[Line], x_label: str = "steps", top: float 
         "steps": steps.tolist(),
         "lines": [[[_short(value) for value in axis] for axis in line.dots] for line in lines],
     }
-    return Chart(title, _drawing(lines, right, top, x_label), tuple(entries), json.dumps(data), len(steps))
+    return LineChart(title, _drawing(lines, right, top, x_label), tuple(entries), json.dumps(data), len(steps))
 
 
 def _readable(value: float) -> str:
@@ -71,21 +71,23 @@ def _short(value: float) -> float:
     return float(f"{value:.5g}")
 
 
-def _drawing(lines: Sequence[Line], right: float, top: float | None, x_label: str) -> str:
+def _drawing(lines: Sequence[ChartSeries], right: float, top: float | None, x_label: str) -> str:
     """SVG without names of lines: the legend is a part of the page."""
     import matplotlib
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
     style = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
-    colors = dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
+    colors = dict.fromkeys(
+        ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK_PLACEHOLDER
+    )
     own = {"svg.fonttype": "none", "svg.hashsalt": "surfkit", "font.size": 10, "text.parse_math": False}
     with matplotlib.rc_context(style | own | colors):
-        figure = Figure(INCHES)
-        axes = figure.add_axes(AXES, xlabel=x_label, facecolor="none")
+        figure = Figure(CHART_SIZE_INCHES)
+        axes = figure.add_axes(AXES_BOX, xlabel=x_label, facecolor="none")
         for at, line in enumerate(lines):
-            dashes = DASHES[at // COLORS % len(DASHES)]
-            color = LINE.format(at % COLORS)
+            dashes = DASHES[at // LINE_COLOR_COUNT % len(DASHES)]
+            color = LINE_PLACEHOLDER.format(at % LINE_COLOR_COUNT)
             axes.plot(*line.dots, color=color, linewidth=1.8, linestyle=(0, dashes or ()), clip_on=False)
         values = np.concatenate([line.dots[1] for line in lines])
         axes.set_xlim(0, right)
@@ -93,7 +95,7 @@ def _drawing(lines: Sequence[Line], right: float, top: float | None, x_label: st
         for axis in (axes.xaxis, axes.yaxis):
             if axis.get_view_interval()[1] >= 1e4:
                 axis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(color=GRID, clip_on=False)
+        axes.grid(color=GRID_PLACEHOLDER, clip_on=False)
         axes.tick_params(length=0)  # without ticks and clipping nothing is referred to, and charts need no ids
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
@@ -110,7 +112,7 @@ def _inline(svg: str) -> str:
     svg = re.sub(r"<defs>.*?</defs>", "", svg, flags=re.DOTALL)
     svg = re.sub(r' id="[^"]*"', "", svg)
     svg = re.sub(r"font(?:-family)?: [^;\"]*; ?", "", re.sub(r"font-size: [\d.]+px; ?", "", svg))
-    svg = re.sub(r"\s*\n\s*", " ", svg).replace(INK, "var(--ink)").replace(GRID, "var(--grid)")
-    for at in range(COLORS):
-        svg = svg.replace(LINE.format(at), f"var(--line-{at})")
+    svg = re.sub(r"\s*\n\s*", " ", svg).replace(INK_PLACEHOLDER, "var(--ink)").replace(GRID_PLACEHOLDER, "var(--grid)")
+    for at in range(LINE_COLOR_COUNT):
+        svg = svg.replace(LINE_PLACEHOLDER.format(at), f"var(--line-{at})")
     return svg

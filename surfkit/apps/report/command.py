@@ -8,13 +8,13 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.apps.report.page import DEFAULT, Options, write_report
+from surfkit.apps.report.page import DEFAULT_FILE, ReportOptions, write_report
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportCommand:
     """Write a report of runs or of an ablation table as one HTML file, which needs no network.
 
     It shows figures, notes, held-out views against their photographs, mesh and geometry, curves, time and memory,
@@ -38,11 +38,11 @@ class Report:
         """Write the file, and print its path and size."""
         if not self.targets:
             raise BadInput("report: name one or more run folders, or the folder of a table")
-        out = self.out or self.targets[0] / DEFAULT
+        out = self.out or self.targets[0] / DEFAULT_FILE
         if out.is_dir():
-            raise BadInput(f"--out {out}: a folder; name a file, such as {out / DEFAULT}")
-        size = write_report(self.targets, out, Options(self.views, self.pictures))
+            raise BadInput(f"--out {out}: a folder; name a file, such as {out / DEFAULT_FILE}")
+        size = write_report(self.targets, out, ReportOptions(self.views, self.pictures))
         print_table(("written", "size"), [(str(out), f"{size / 1e6:.2f} MB")])
 
 
-COMMAND = Report
+COMMAND = ReportCommand

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 
 @dataclass(frozen=True)
-class Picture:
+class EmbeddedPicture:
     """A picture, or a part of one, that lies in a file.
 
     Attributes:
@@ -24,7 +24,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One cell of a table.
 
     Attributes:
@@ -43,7 +43,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableElement:
     """Rows below a head; columns that hold numbers are set to the right.
 
     Attributes:
@@ -57,7 +57,7 @@ class Table:
     kind: ClassVar[str] = "table"
     caption: str
     head: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[TableCell, ...], ...]
     is_sortable: bool = False
     dimmed: tuple[int, ...] = ()
 
@@ -74,7 +74,7 @@ class LegendEntry:
 
 
 @dataclass(frozen=True)
-class Chart:
+class LineChart:
     """A chart of lines.
 
     Attributes:
@@ -98,7 +98,7 @@ class Figure:
     """A picture with a caption."""
 
     kind: ClassVar[str] = "figure"
-    picture: Picture
+    picture: EmbeddedPicture
     caption: str
 
 
@@ -114,12 +114,12 @@ class Compare:
 
     kind: ClassVar[str] = "compare"
     title: str
-    layers: tuple[tuple[str, Picture], ...]
+    layers: tuple[tuple[str, EmbeddedPicture], ...]
     is_titled: bool = True
 
 
 @dataclass(frozen=True)
-class Row:
+class ElementRow:
     """Charts or pictures side by side, as far as there is room: small ones also on a phone.
 
     Attributes:
@@ -133,7 +133,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Group:
+class ElementGroup:
     """Elements below a heading, which may be empty, with an address within the page if `id` is not."""
 
     kind: ClassVar[str] = "group"
@@ -167,7 +167,7 @@ class Listing:
     items: tuple[str, ...]
 
 
-Element = Table | Chart | Figure | Compare | Row | Group | Details | Prose | Listing
+Element = TableElement | LineChart | Figure | Compare | ElementRow | ElementGroup | Details | Prose | Listing
 
 
 @dataclass(frozen=True)
@@ -179,12 +179,12 @@ class Section:
     elements: tuple[Element, ...]
 
 
-def pictures(elements: tuple[Element, ...]) -> Iterator[Picture]:
+def pictures(elements: tuple[Element, ...]) -> Iterator[EmbeddedPicture]:
     """All pictures, in the order of the page."""
     for element in elements:
         if isinstance(element, Figure):
             yield element.picture
         elif isinstance(element, Compare):
             yield from (picture for _, picture in element.layers)
-        elif isinstance(element, (Row, Group, Details)):
+        elif isinstance(element, (ElementRow, ElementGroup, Details)):
             yield from pictures(element.elements)

@@ -10,16 +10,16 @@ from pathlib import Path
 
 from PIL import Image
 
-from surfkit.apps.report.elements import Picture
+from surfkit.apps.report.elements import EmbeddedPicture
 from surfkit.core.check import BadInput
 
-BUDGET = 12_000_000
+MAX_PICTURE_BYTES = 12_000_000
 """Bytes of all pictures of a page, as they stand in it."""
-SIDES = (1200, 960, 720, 540, 400)
+LONGEST_SIDES_PX = (1200, 960, 720, 540, 400)
 """Longest sides in pixels; the first at which all pictures fit is taken."""
 UNREADABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 """What Pillow raises for files that are no pictures."""
-QUALITY = 82
+WEBP_QUALITY = 82
 """Of WebP, 0 to 100."""
 
 
@@ -32,14 +32,14 @@ class Encoded:
     height: int
 
 
-def encode_all(pictures: Iterable[Picture], budget: int = BUDGET) -> dict[Picture, Encoded]:
+def encode_all(pictures: Iterable[EmbeddedPicture], budget: int = MAX_PICTURE_BYTES) -> dict[EmbeddedPicture, Encoded]:
     """Every picture, no larger than it is and as large as the budget allows.
 
     Raises:
         BadInput: They do not fit at the least size, or a file is no picture.
     """
     wanted = list(dict.fromkeys(pictures))
-    for side in SIDES:
+    for side in LONGEST_SIDES_PX:
         found, left = {}, budget
         for picture in wanted:
             found[picture] = encode(picture, side)
@@ -49,7 +49,8 @@ def encode_all(pictures: Iterable[Picture], budget: int = BUDGET) -> dict[Pictur
         else:
             return found
     raise BadInput(
-        f"report: {len(wanted)} pictures take more than {budget / 1e6:.3g} MB even at {SIDES[-1]} pixels; lower "
+        f"report: {len(wanted)} pictures take more than {budget / 1e6:.3g} MB even at {LONGEST_SIDES_PX[-1]} pixels; "
+        f"lower "
         "--views, name fewer runs, or give --no-pictures"
     )
 
@@ -67,7 +68,7 @@ def image_size(path: Path) -> tuple[int, int]:
         raise BadInput(f"{path}: cannot be read as a picture ({error}); delete it") from error
 
 
-def encode(picture: Picture, side: int) -> Encoded:
+def encode(picture: EmbeddedPicture, side: int) -> Encoded:
     """A picture as WebP, reduced to a longest side.
 
     Raises:
@@ -80,5 +81,5 @@ def encode(picture: Picture, side: int) -> Encoded:
         raise BadInput(f"{picture.path}: cannot be read as a picture ({error}); delete it") from error
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
-    image.save(buffer, "WEBP", quality=QUALITY, method=4)
+    image.save(buffer, "WEBP", quality=WEBP_QUALITY, method=4)
     return Encoded(f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}", *image.size)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surfkit.apps.report.elements import Cell, Group, Section, Table, pictures
+from surfkit.apps.report.elements import ElementGroup, Section, TableCell, TableElement, pictures
 from surfkit.apps.report.gallery import encode_all
-from surfkit.apps.report.sections.ablation import NAME, read_table, row_runs, table_section
+from surfkit.apps.report.sections.ablation import ABLATION_FILE, read_table, row_runs, table_section
 from surfkit.apps.report.sections.blocks import blocks
 from surfkit.apps.report.sections.compressed import compressed
 from surfkit.apps.report.sections.configuration import configuration
@@ -22,21 +22,21 @@ from surfkit.apps.report.sections.resources import resources
 from surfkit.apps.report.sections.results import results
 from surfkit.apps.report.sections.surface import geometry, meshes
 from surfkit.apps.report.sections.views import held_out
-from surfkit.apps.report.source import Source, read_sources
-from surfkit.apps.report.values import NONE
+from surfkit.apps.report.source import RunFiles, read_sources
+from surfkit.apps.report.values import NO_VALUE
 from surfkit.core.check import BadInput, printable
 from surfkit.core.files import replacing
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-TEMPLATES = Path(__file__).parent / "templates"
-DEFAULT = "report.html"
+PAGE_TEMPLATES = Path(__file__).parent / "templates"
+DEFAULT_FILE = "report.html"
 """Name of the file in the folder of the first run, or of the table."""
 
 
 @dataclass(frozen=True)
-class Options:
+class ReportOptions:
     """What a report shows.
 
     Attributes:
@@ -53,7 +53,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Page:
+class ReportPage:
     """All of a page.
 
     Attributes:
@@ -65,32 +65,33 @@ class Page:
     sections: tuple[Section, ...]
 
 
-def page_of(folders: Sequence[Path], options: Options) -> Page:
+def page_of(folders: Sequence[Path], options: ReportOptions) -> ReportPage:
     """The report of some run folders, or of the folder of an ablation table.
 
     Raises:
         BadInput: A folder is neither, a table is named with anything else, or a file is damaged.
     """
     for folder in folders:
-        if not (folder / NAME).is_file() and not (folder / "recipe.json").is_file():
+        if not (folder / ABLATION_FILE).is_file() and not (folder / "recipe.json").is_file():
             raise BadInput(
-                f"{folder}: neither a run folder (recipe.json, run.json) nor a table ({NAME}); name one that surfkit "
+                f"{folder}: neither a run folder (recipe.json, run.json) nor a table ({ABLATION_FILE}); name one "
+                f"that surfkit "
                 "train or surfkit ablate made"
             )
-    tables = [folder for folder in folders if (folder / NAME).is_file()]
+    tables = [folder for folder in folders if (folder / ABLATION_FILE).is_file()]
     if not tables:
         runs = read_sources(folders)
-        return Page(", ".join(run.name for run in runs), run_sections(runs, options))
+        return ReportPage(", ".join(run.name for run in runs), run_sections(runs, options))
     if len(folders) > 1:
         raise BadInput(f"{tables[0]}: a table is reported alone; name this folder only, or run folders only")
     report = read_table(tables[0])
     by_row = row_runs(tables[0], report)
     sections = run_sections(tuple(by_row.values()), options) if by_row else ()
     shown = tuple(section for section in sections if section.id != "results")
-    return Page(f"table:{report.get('table')}", (table_section(report, by_row), *shown))
+    return ReportPage(f"table:{report.get('table')}", (table_section(report, by_row), *shown))
 
 
-def run_sections(runs: Sequence[Source], options: Options) -> tuple[Section, ...]:
+def run_sections(runs: Sequence[RunFiles], options: ReportOptions) -> tuple[Section, ...]:
     """All sections that the runs have something for."""
     drawn = options.with_pictures
     found = (
@@ -113,27 +114,29 @@ def run_sections(runs: Sequence[Source], options: Options) -> tuple[Section, ...
     return (sections[0], index, *sections[1:])
 
 
-def index_of(runs: Sequence[Source], sections: Sequence[Section]) -> Table:
+def index_of(runs: Sequence[RunFiles], sections: Sequence[Section]) -> TableElement:
     """Links to what the sections say of each run."""
-    groups = [element for section in sections for element in section.elements if isinstance(element, Group)]
+    groups = [element for section in sections for element in section.elements if isinstance(element, ElementGroup)]
     there = {group.id for group in groups}
     by_run = [section for section in sections if any(run.id(section.id) in there for run in runs)]
     rows = []
     for run in runs:
         links = [(section.title, run.id(section.id)) for section in by_run]
-        cells = [Cell(title, link=address) if address in there else Cell(NONE) for title, address in links]
-        rows.append((Cell(run.name), *cells))
+        cells = [
+            TableCell(title, link=address) if address in there else TableCell(NO_VALUE) for title, address in links
+        ]
+        rows.append((TableCell(run.name), *cells))
     head = ("run", *(section.title for section in by_run))
-    return Table("Where the page tells of each run", head, tuple(rows))
+    return TableElement("Where the page tells of each run", head, tuple(rows))
 
 
-def html(page: Page) -> str:
+def html(page: ReportPage) -> str:
     """The page as one file that loads nothing; a policy in it forbids the network and all scripts but its own.
 
     Raises:
         BadInput: The pictures take too much room.
     """
-    style, script = ((TEMPLATES / name).read_text(encoding="utf-8").strip() for name in ("page.css", "page.js"))
+    style, script = ((PAGE_TEMPLATES / name).read_text(encoding="utf-8").strip() for name in ("page.css", "page.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     shown = encode_all(picture for section in page.sections for picture in pictures(section.elements))
     template = environment().get_template("page.html.j2")
@@ -144,7 +147,7 @@ def environment() -> Environment:
     """The templates; whatever they print is escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    loader = FileSystemLoader(TEMPLATES)
+    loader = FileSystemLoader(PAGE_TEMPLATES)
     return Environment(
         loader=loader,
         autoescape=True,
@@ -160,7 +163,7 @@ def _quoted(value: Any) -> Any:
     return printable(value, lines=True) if type(value) is str else value
 
 
-def write_report(folders: Sequence[Path], out: Path, options: Options) -> int:
+def write_report(folders: Sequence[Path], out: Path, options: ReportOptions) -> int:
     """Write the report of some folders, whole or not at all, and return its size in bytes.
 
     Raises:

@@ -17,7 +17,7 @@ from surfkit.runs import journal
 from surfkit.runs.folder import refuse_no_run
 from surfkit.study.curves import thinned
 
-FILES = {
+JSON_FILES = {
     "recipe": "recipe.json",
     "record": "run.json",
     "metrics": "metrics.json",
@@ -25,11 +25,11 @@ FILES = {
     "compressed": "compressed/compressed.json",
     "plan": "blocks/plan.json",
 }
-"""JSON files of a run folder, by the attributes of `Source`."""
+"""JSON files of a run folder, by the attributes of `RunFiles`."""
 
 
 @dataclass(frozen=True)
-class Part:
+class JournaledStage:
     """A part of a run whose steps are counted on their own: the first stage, a block, a refinement.
 
     Attributes:
@@ -54,7 +54,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Source:
+class RunFiles:
     """A run folder.
 
     Attributes:
@@ -80,7 +80,7 @@ class Source:
     plan: dict[str, Any]
 
     @cached_property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[JournaledStage, ...]:
         """The first stage, then blocks, then refinements, as far as they are begun."""
         first = "first stage" if self.plan or (self.out / "refine0").is_dir() else "training"
         found = [(first, self.out)]
@@ -88,16 +88,16 @@ class Source:
             named = [(path.name.removeprefix(before), path) for path in self.out.glob(pattern)]
             numbered = sorted((int(name), path) for name, path in named if name.isdecimal())
             found += [(f"{title} {index}", path) for index, path in numbered]
-        parts = [Part(title, folder, journal.read(folder / journal.NAME)) for title, folder in found]
+        parts = [JournaledStage(title, folder, journal.read(folder / journal.JOURNAL_FILE)) for title, folder in found]
         return tuple(part for part in parts if part.lines)
 
     @property
-    def first(self) -> Part:
+    def first(self) -> JournaledStage:
         """The first stage, perhaps without a line."""
-        return next((part for part in self.parts if part.folder == self.out), Part("training", self.out, []))
+        return next((part for part in self.parts if part.folder == self.out), JournaledStage("training", self.out, []))
 
     @property
-    def blocks(self) -> tuple[Part, ...]:
+    def blocks(self) -> tuple[JournaledStage, ...]:
         """The blocks that are begun."""
         return tuple(part for part in self.parts if part.title.startswith("block "))
 
@@ -117,18 +117,18 @@ class Source:
         return f"{section}-{self.number}"
 
 
-def read_source(out: Path, name: str, at: int) -> Source:
+def read_source(out: Path, name: str, at: int) -> RunFiles:
     """What lies in a run folder.
 
     Raises:
         BadInput: It is none, or one of its files is damaged.
     """
     refuse_no_run(out)
-    found = {key: out / file for key, file in FILES.items()}
-    return Source(name, at, out, **{k: read_json(p, dict[str, Any]) if p.exists() else {} for k, p in found.items()})
+    found = {key: out / file for key, file in JSON_FILES.items()}
+    return RunFiles(name, at, out, **{k: read_json(p, dict[str, Any]) if p.exists() else {} for k, p in found.items()})
 
 
-def read_sources(outs: Sequence[Path]) -> tuple[Source, ...]:
+def read_sources(outs: Sequence[Path]) -> tuple[RunFiles, ...]:
     """The runs in some folders, each with a name that no other one has.
 
     Raises:
@@ -149,6 +149,6 @@ def total_loss(line: dict[str, Any]) -> float | None:
     return None if None in values else sum(values)
 
 
-def heading(run: Source, runs: Sequence[Source]) -> str:
+def heading(run: RunFiles, runs: Sequence[RunFiles]) -> str:
     """What stands above a part of a section that is about one run: nothing where there is only one."""
     return run.name if len(runs) > 1 else ""

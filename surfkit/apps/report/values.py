@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from surfkit.apps.report.elements import Cell
+from surfkit.apps.report.elements import TableCell
 
-NONE = "\N{EN DASH}"
+NO_VALUE = "\N{EN DASH}"
 """Shown where there is nothing."""
 
 
@@ -147,11 +147,11 @@ def of_metrics(metrics: Mapping[str, Any], name: str) -> float | None:
     return next((value for value in found if value is not None), None)
 
 
-def plain(*items: Any) -> tuple[Cell, ...]:
+def plain(*items: Any) -> tuple[TableCell, ...]:
     """A row of a table out of cells and plain values."""
-    return tuple(item if isinstance(item, Cell) else Cell(in_words(item)) for item in items)
+    return tuple(item if isinstance(item, TableCell) else TableCell(in_words(item)) for item in items)
 
 
-def numeric(value: float | None, shown: str, note: str = "") -> Cell:
+def numeric(value: float | None, shown: str, note: str = "") -> TableCell:
     """A cell of a number, or of none."""
-    return Cell(NONE) if value is None else Cell(shown, value, note)
+    return TableCell(NO_VALUE) if value is None else TableCell(shown, value, note)

@@ -19,9 +19,9 @@ from surfkit.apps.sfm.settings import Settings
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing_folder
 
-RECIPE = "2"
+CACHE_VERSION = "2"
 """Changes when the same model would be adjusted otherwise."""
-WORSE = 1.1
+MAX_ERROR_RATIO = 1.1
 """An adjustment that makes the mean reprojection error larger than this many times is not kept."""
 
 
@@ -30,7 +30,7 @@ def adjust_once(
 ) -> Any | None:
     """What `adjust` gives, from the folder where an earlier call has kept it for the same model, EXIF and positions."""
     where = [list(camera.params) for camera in model.cameras.values()], model.num_points3D(), centres_of(model)
-    facts = [RECIPE, settings.seed, where, sorted(known_focals(model, photos, placement is not None).items())]
+    facts = [CACHE_VERSION, settings.seed, where, sorted(known_focals(model, photos, placement is not None).items())]
     if placement is not None:
         fit = placement.fit
         facts += [placement.names, placement.onto.tolist(), fit.inside.tolist(), placement.sigma.tolist()]
@@ -75,7 +75,7 @@ def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo],
     summary = run("adjusting cameras", solve)
     found = _taken_over(engine, model, new)
     before, after = _error(engine.Reconstruction(model)), _error(found)
-    return found if summary.is_solution_usable() and after <= WORSE * before else None
+    return found if summary.is_solution_usable() and after <= MAX_ERROR_RATIO * before else None
 
 
 def _priors(engine: Any, model: Any, placement: Placement) -> list[Any]:

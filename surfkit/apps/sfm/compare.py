@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from surfkit.apps.sfm.features import FEWEST, feature_file, find_features, read_features
+from surfkit.apps.sfm.features import MIN_FEATURES, feature_file, find_features, read_features
 from surfkit.apps.sfm.matching import contents, match, refuse_other
 from surfkit.apps.sfm.pairs import Pair, choose_pairs
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.sources import Sources
 from surfkit.core.codec import read_json, write_json
-from surfkit.core.stages import Stages, key_of
+from surfkit.core.stages import StageFolder, key_of
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Compared:
 
 
 def compare(
-    stages: Stages,
+    stages: StageFolder,
     photos: Sequence[Photo],
     sources: Sources,
     work: Path,
@@ -61,7 +61,7 @@ def compare(
     """
     folder, database, listed = work / "features", work / "database.db", work / "pairs.json"
     counts = stages.run("features", "", lambda: find_features(photos, sources, folder, settings, device))
-    rich = [photo for photo in photos if counts[photo.name] >= FEWEST]
+    rich = [photo for photo in photos if counts[photo.name] >= MIN_FEATURES]
     made_of = contents(rich, folder, settings, cameras)
 
     def descriptors(at: int) -> np.ndarray:

@@ -22,25 +22,25 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import delete_with_folders, replacing, replacing_folder
-from surfkit.io.datasets.placed import FILE, Placed
+from surfkit.io.datasets.placed import GEOREFERENCE_FILE, Georeference
 from surfkit.scene.names import safe_path
 from surfkit.scene.photos import read_photo
 from surfkit.scene.pixels import Pixels
 
-RECIPE = "1"
+CACHE_VERSION = "1"
 """Changes when the same photograph would come out otherwise."""
-QUALITY = 95
+JPEG_QUALITY = 95
 """Of JPEG files."""
-MOST_THREADS = 8
+MAX_PHOTO_THREADS = 8
 """Each holds a photograph at its full size three times."""
-RECORD = "undistorted.json"
+UNDISTORTED_RECORD = "undistorted.json"
 SAME_CAMERA, SAME_POINT, SAME_PX = 1e-7, 1e-6, 1e-4
 """Models that differ by less are one: positions as shares of the spread of the cameras, rotations in radians, and focal
 lengths in pixels. That is a hundredth of a pixel; solvers that add up in another order differ by a hundredth of it."""
 
 
 @dataclass(frozen=True)
-class Sight:
+class UndistortedImage:
     """What an undistorted photograph adds to its model.
 
     Attributes:
@@ -53,7 +53,11 @@ class Sight:
 
 
 def deliver(
-    models: Sequence[tuple[Any, Placed | None]], photos: Mapping[str, Photo], sources: Sources, scene: Path, work: Path
+    models: Sequence[tuple[Any, Georeference | None]],
+    photos: Mapping[str, Photo],
+    sources: Sources,
+    scene: Path,
+    work: Path,
 ) -> None:
     """Write SCENE/images and SCENE/sparse/0, 1, ...; photographs that are there already are not written again.
 
@@ -65,14 +69,14 @@ def deliver(
         work: Folder for the record of what was written.
     """
     try:
-        before = read_json(work / RECORD, dict[str, str])
+        before = read_json(work / UNDISTORTED_RECORD, dict[str, str])
     except BadInput:
         before = {}
     lenses = [(image.name, model.cameras[image.camera_id]) for model, _ in models for image in _images(model)]
     wanted = {file_name(name): _key(photos[name], camera) for name, camera in lenses}
     if any(before.get(name) != key for name, key in wanted.items()):
         before = {name: key if wanted.get(name, key) == key else "" for name, key in before.items()}
-        write_json(work / RECORD, before)  # what a kill leaves half replaced counts as neither
+        write_json(work / UNDISTORTED_RECORD, before)  # what a kill leaves half replaced counts as neither
         shutil.rmtree(scene / "sparse", ignore_errors=True)  # a model of other photographs would not be noticed
     total, done = sum(model.num_reg_images() for model, _ in models), 0
     kept: dict[str, str] = {}
@@ -81,9 +85,9 @@ def deliver(
         images = _images(model)
         cameras = {image.camera_id: _pinhole(model.cameras[image.camera_id]) for image in images}
         sights = {}
-        with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_PHOTO_THREADS)) as pool:
 
-            def undistort(image: Any, model: Any = model) -> Sight:
+            def undistort(image: Any, model: Any = model) -> UndistortedImage:
                 key = _key(photos[image.name], model.cameras[image.camera_id])
                 name = file_name(image.name)
                 source = sources.path(image.name)
@@ -102,12 +106,12 @@ def deliver(
                 pool.shutdown(cancel_futures=True)
                 raise
             finally:
-                write_json(work / RECORD, before | kept)
+                write_json(work / UNDISTORTED_RECORD, before | kept)
         pinholes.append(_rebuilt(model, images, cameras, sights))
     for name in set(before) - set(kept):
         if str(safe_path(name)) == name:  # the record may be another's
             delete_with_folders(scene / "images" / name, scene)
-    write_json(work / RECORD, kept)
+    write_json(work / UNDISTORTED_RECORD, kept)
     with replacing_folder(scene / "sparse") as folder:
         for number, (pinhole, (_, placed)) in enumerate(zip(pinholes, models, strict=True)):
             (folder / str(number)).mkdir()
@@ -118,7 +122,7 @@ def deliver(
             else:
                 pinhole.write_binary(folder / str(number))
             if placed is not None:
-                write_json(folder / str(number) / FILE, placed)
+                write_json(folder / str(number) / GEOREFERENCE_FILE, placed)
 
 
 def _is_same(folder: Path, new: Any) -> bool:
@@ -158,7 +162,7 @@ def file_name(name: str) -> str:
 
 
 def _key(photo: Photo, camera: Any) -> str:
-    said = f"{RECIPE} {QUALITY} {photo.digest} {camera.model.name} {np.round(camera.params, 7).tolist()}"
+    said = f"{CACHE_VERSION} {JPEG_QUALITY} {photo.digest} {camera.model.name} {np.round(camera.params, 7).tolist()}"
     return hashlib.sha256(said.encode()).hexdigest()[:24]
 
 
@@ -171,7 +175,7 @@ def _pinhole(camera: Any) -> Any:
         raise BadInput(f"the lens that was found cannot be undistorted: {said}; choose another with --lens") from error
 
 
-def _write(source: Path, reading: Pixels, target: Path, model: Any, image: Any, there: bool) -> Sight:
+def _write(source: Path, reading: Pixels, target: Path, model: Any, image: Any, there: bool) -> UndistortedImage:
     """Write an undistorted photograph unless it is there, and look at it where its features are."""
     engine = load_engine()
     camera = model.cameras[image.camera_id]
@@ -185,16 +189,18 @@ def _write(source: Path, reading: Pixels, target: Path, model: Any, image: Any, 
             if target.suffix.lower() == ".png":
                 Image.fromarray(straight).save(file, "PNG", compress_level=1)
             else:
-                Image.fromarray(straight).save(file, "JPEG", quality=QUALITY, subsampling=0)
+                Image.fromarray(straight).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     straight = read_photo(target, (pinhole.width, pinhole.height)).permute(1, 2, 0).numpy()
     rays = np.asarray(camera.cam_from_img(bent)).reshape(-1, 2)
     spots = np.asarray(pinhole.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))).reshape(-1, 2)
     column = np.floor(np.nan_to_num(spots[:, 0])).clip(0, pinhole.width - 1).astype(int)
     row = np.floor(np.nan_to_num(spots[:, 1])).clip(0, pinhole.height - 1).astype(int)
-    return Sight(spots, straight[row, column])
+    return UndistortedImage(spots, straight[row, column])
 
 
-def _rebuilt(model: Any, images: Sequence[Any], cameras: Mapping[int, Any], sights: Mapping[int, Sight]) -> Any:
+def _rebuilt(
+    model: Any, images: Sequence[Any], cameras: Mapping[int, Any], sights: Mapping[int, UndistortedImage]
+) -> Any:
     """The model with pinhole cameras, with features that have a point only, and with colours."""
     engine = load_engine()
     new = engine.Reconstruction()

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from surfkit.apps.sfm.deliver import MOST_THREADS, file_name
+from surfkit.apps.sfm.deliver import MAX_PHOTO_THREADS, file_name
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.sources import Sources
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import delete_with_folders, replacing
-from surfkit.io.datasets.masks import FOLDER
+from surfkit.io.datasets.masks import MASKS_FOLDER
 
-RECIPE = "1"
+CACHE_VERSION = "1"
 """Changes when the same mask would come out otherwise."""
-RECORD = "masks.json"
+MASKS_RECORD = "masks.json"
 """What was written; other masks are those of the user."""
 
 
@@ -43,7 +43,7 @@ def deliver_masks(
         BadInput: A mask of somebody else would be replaced.
     """
     try:
-        before = read_json(work / RECORD, dict[str, str])
+        before = read_json(work / MASKS_RECORD, dict[str, str])
     except BadInput:
         before = {}
     wanted: dict[str, tuple[str, str, Any]] = {}
@@ -51,21 +51,21 @@ def deliver_masks(
         for image in (model.image(number) for number in model.reg_image_ids()):
             if photos[image.name].mask:
                 camera = model.cameras[image.camera_id]
-                said = f"{RECIPE} {photos[image.name].mask} {camera.model.name} {list(camera.params)}"
+                said = f"{CACHE_VERSION} {photos[image.name].mask} {camera.model.name} {list(camera.params)}"
                 key = hashlib.sha256(said.encode()).hexdigest()[:24]
                 wanted[f"{file_name(image.name)}.png"] = key, image.name, camera
-    folder = scene / FOLDER
+    folder = scene / MASKS_FOLDER
     if foreign := [name for name in wanted if name not in before and (folder / name).exists()]:
         raise BadInput(f"{folder / foreign[0]} is there, and this command did not make it; move {folder} away")
     if not wanted and not before:
         return
     todo = {name: each for name, each in wanted.items() if before.get(name) != each[0] or not (folder / name).is_file()}
-    write_json(work / RECORD, before | dict.fromkeys(todo, ""))  # what a kill leaves is ours, and made again
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+    write_json(work / MASKS_RECORD, before | dict.fromkeys(todo, ""))  # what a kill leaves is ours, and made again
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_PHOTO_THREADS)) as pool:
         list(pool.map(lambda name: _write(sources, todo[name][1], folder / name, todo[name][2]), todo))
     for name in set(before) - set(wanted):
         delete_with_folders(folder / name, scene)
-    write_json(work / RECORD, {name: key for name, (key, _, _) in wanted.items()})
+    write_json(work / MASKS_RECORD, {name: key for name, (key, _, _) in wanted.items()})
 
 
 def _write(sources: Sources, name: str, target: Path, camera: Any) -> None:

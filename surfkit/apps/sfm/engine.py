@@ -13,7 +13,7 @@ from surfkit.core.signals import asking
 from surfkit.io.datasets.capture import load_pycolmap
 
 T = TypeVar("T")
-POLL_S = 0.2
+INTERRUPT_POLL_S = 0.2
 """How often the main thread looks for Ctrl-C."""
 
 
@@ -53,7 +53,9 @@ def run(what: str, work: Callable[[Any], T]) -> T:
     thread = threading.Thread(target=body, name=what)
     try:
         thread.start()
-        while not ended.wait(POLL_S):  # Thread.join, interrupted, takes a running thread for one that has ended
+        while not ended.wait(
+            INTERRUPT_POLL_S
+        ):  # Thread.join, interrupted, takes a running thread for one that has ended
             pass
     except BaseException:
         with _undisturbed():

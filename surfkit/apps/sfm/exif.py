@@ -16,24 +16,32 @@ from surfkit.apps.sfm.xmp import read_xmp
 # What is damaged counts as not said.
 warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
-MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
-TAKEN, SUBSECOND, FOCAL_MM, FOCAL35_MM = 0x9003, 0x9291, 0x920A, 0xA405
-BODY, LENS = 0xA431, 0xA435
+MAKE_TAG, MODEL_TAG, ORIENTATION_TAG = 0x010F, 0x0110, 0x0112
+TAKEN_TAG, SUBSECOND_TAG, FOCAL_MM_TAG, FOCAL35_MM_TAG = 0x9003, 0x9291, 0x920A, 0xA405
+BODY_SERIAL_TAG, LENS_SERIAL_TAG = 0xA431, 0xA435
 """Serial numbers."""
-PIXELS_X, PER_UNIT_X, UNIT = 0xA002, 0xA20E, 0xA210
-LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, ERROR_M = 1, 2, 3, 4, 5, 6, 31
+PIXELS_X_TAG, PER_UNIT_X_TAG, UNIT_TAG = 0xA002, 0xA20E, 0xA210
+LATITUDE_REF_TAG, LATITUDE_TAG, LONGITUDE_REF_TAG, LONGITUDE_TAG, ALTITUDE_REF_TAG, ALTITUDE_TAG, ERROR_M_TAG = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    31,
+)
 UNIT_MM = {2: 25.4, 3: 10.0}
 """Of the focal plane's resolution: inch, centimetre."""
 DIAGONAL35_MM = math.hypot(36, 24)
 """Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
-LIKELY = (0.1, 10.0)
+LIKELY_FOCAL_RANGE = (0.1, 10.0)
 """Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
-MOST_ERROR_M = 1e4
+MAX_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
-ABOVE, BELOW = (0, 2), (1, 3)
+ABOVE_REFERENCES, BELOW_REFERENCES = (0, 2), (1, 3)
 """References of altitudes, see `_zero`."""
-SEA_LEVEL = (2, 3)
-VERSION = 36864
+SEA_LEVEL_REFERENCES = (2, 3)
+EXIF_VERSION_TAG = 36864
 """Tag of the version of EXIF: 0232, 0300."""
 RTK_FLAG = "RtkFlag"
 """In XMP of DJI: 0 without RTK; 16, 34 or 50 where the position is of that receiver."""
@@ -107,10 +115,10 @@ def facts(
     size: tuple[int, int],
 ) -> Exif:
     """The facts in the tags of the three parts of EXIF and in the numbers of XMP."""
-    names = [_text(basic.get(tag)) for tag in (MAKE, MODEL)]
-    taken = _text(camera.get(TAKEN))
-    part = _text(camera.get(SUBSECOND))
-    turned = basic.get(ORIENTATION, 1)
+    names = [_text(basic.get(tag)) for tag in (MAKE_TAG, MODEL_TAG)]
+    taken = _text(camera.get(TAKEN_TAG))
+    part = _text(camera.get(SUBSECOND_TAG))
+    turned = basic.get(ORIENTATION_TAG, 1)
     position, unsigned = _position(gps)
     return Exif(
         camera=" ".join(filter(None, names)) or None,
@@ -130,16 +138,16 @@ def facts(
 
 
 def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
-    found = [*(_text(tags.get(tag)) for tag in (BODY, LENS)), xmp.get("RigCameraIndex")]
+    found = [*(_text(tags.get(tag)) for tag in (BODY_SERIAL_TAG, LENS_SERIAL_TAG)), xmp.get("RigCameraIndex")]
     return " ".join(str(part) for part in found if part is not None) or None
 
 
 def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    focal, equivalent = _number(tags.get(FOCAL_MM)), _number(tags.get(FOCAL35_MM))
+    focal, equivalent = _number(tags.get(FOCAL_MM_TAG)), _number(tags.get(FOCAL35_MM_TAG))
     if equivalent and _is_likely(found := equivalent / DIAGONAL35_MM * math.hypot(*size), size):
         return found
-    density, unit = _number(tags.get(PER_UNIT_X)), UNIT_MM.get(tags.get(UNIT, 2))
-    width = _number(tags.get(PIXELS_X))
+    density, unit = _number(tags.get(PER_UNIT_X_TAG)), UNIT_MM.get(tags.get(UNIT_TAG, 2))
+    width = _number(tags.get(PIXELS_X_TAG))
     if not (focal and density and unit and width):
         return None
     sensor_mm = width / density * unit  # of the direction that was the width when the photograph was taken
@@ -148,17 +156,17 @@ def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
 
 
 def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:
-    return LIKELY[0] < focal_px / max(size) < LIKELY[1]
+    return LIKELY_FOCAL_RANGE[0] < focal_px / max(size) < LIKELY_FOCAL_RANGE[1]
 
 
 def _position(tags: Mapping[int, Any]) -> tuple[Position | None, tuple[str, ...]]:
     """The position, and which of latitude and longitude have no sign."""
-    latitude, north = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "N", "S", 90)
-    longitude, east = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "E", "W", 180)
+    latitude, north = _degrees(tags.get(LATITUDE_TAG), tags.get(LATITUDE_REF_TAG), "N", "S", 90)
+    longitude, east = _degrees(tags.get(LONGITUDE_TAG), tags.get(LONGITUDE_REF_TAG), "E", "W", 180)
     if latitude is None or longitude is None or (latitude, longitude) == (0, 0):  # a receiver without a fix
         return None, ()
-    altitude = _number(tags.get(ALTITUDE), negative=True)
-    if altitude is not None and _reference(tags) in BELOW:
+    altitude = _number(tags.get(ALTITUDE_TAG), negative=True)
+    if altitude is not None and _reference(tags) in BELOW_REFERENCES:
         altitude = -abs(altitude)
     unsigned = tuple(name for name, known in (("latitude", north), ("longitude", east)) if not known)
     return (latitude, longitude, altitude), unsigned
@@ -184,12 +192,12 @@ def _degrees(value: Any, letter: Any, positive: str, negative: str, most: float)
 
 def _reference(tags: Mapping[int, Any]) -> int | None:
     """What the altitude is counted from; None where that is not said."""
-    value = tags.get(ALTITUDE_REF)
+    value = tags.get(ALTITUDE_REF_TAG)
     try:
         found = value[0] if isinstance(value, bytes) else int(value)
     except (TypeError, ValueError, IndexError):
         return None
-    return found if found in (*ABOVE, *BELOW) else None
+    return found if found in (*ABOVE_REFERENCES, *BELOW_REFERENCES) else None
 
 
 def _zero(gps: Mapping[int, Any], camera: Mapping[int, Any], xmp: Mapping[str, float]) -> Zero | None:
@@ -198,12 +206,12 @@ def _zero(gps: Mapping[int, Any], camera: Mapping[int, Any], xmp: Mapping[str, f
     References 2 and 3 are the sea level. 0 and 1 were it until EXIF 3.0, which made them the ellipsoid. Drones with RTK
     write heights above the ellipsoid under the old 0, as there was no other.
     """
-    if ALTITUDE not in gps and xmp_names.ALTITUDE not in xmp:
+    if ALTITUDE_TAG not in gps and xmp_names.ALTITUDE not in xmp:
         return None
     reference = _reference(gps)
-    if reference in SEA_LEVEL:
+    if reference in SEA_LEVEL_REFERENCES:
         return "sea level"
-    is_new = reference is not None and (_text(camera.get(VERSION)) or "") >= "0300"
+    is_new = reference is not None and (_text(camera.get(EXIF_VERSION_TAG)) or "") >= "0300"
     return "ellipsoid" if is_new or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
 
 
@@ -217,9 +225,9 @@ def _xmp_position(xmp: Mapping[str, float]) -> Position | None:
 def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
     rtk = tuple(xmp.get(name, 0.0) for name in ("RtkStdLon", "RtkStdLat", "RtkStdHgt"))
     across, up = xmp.get("GPSXYAccuracy", 0.0), xmp.get("GPSZAccuracy", 0.0)
-    stated = _number(gps.get(ERROR_M)) or 0.0
+    stated = _number(gps.get(ERROR_M_TAG)) or 0.0
     for found in (rtk, (across, across, up), (stated, stated, 2 * stated)):  # heights are half as exact by GPS
-        if all(0 < value < MOST_ERROR_M for value in found):
+        if all(0 < value < MAX_ERROR_M for value in found):
             return found  # type: ignore[return-value]
     return None
 

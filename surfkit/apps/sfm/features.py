@@ -20,16 +20,16 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.scene.photos import read_photo
 
-RECIPE = "1"
+CACHE_VERSION = "1"
 """Changes when the same photograph would give other features."""
-FEWEST = 50
+MIN_FEATURES = 50
 """A photograph with fewer features cannot be placed."""
 
 
 def feature_file(folder: Path, photo: Photo, settings: Settings) -> Path:
     """Where the features of a photograph are kept."""
     way = f"{dump(settings.features)} {settings.features.version} {settings.max_features}"
-    said = f"{RECIPE} {photo.digest} {settings.longest} {way}{photo.mask and f' {photo.mask}'}"
+    said = f"{CACHE_VERSION} {photo.digest} {settings.longest} {way}{photo.mask and f' {photo.mask}'}"
     return folder / f"{hashlib.sha256(said.encode()).hexdigest()[:24]}.npz"
 
 

@@ -17,20 +17,20 @@ import numpy as np
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.photographs import Photo
 
-SIGMA = 0.03
+EXIF_FOCAL_SIGMA = 0.03
 """Standard deviation of the focal length of EXIF, as a share: it is rounded, and lenses differ by some percent."""
-SIGMA_ALONE = 0.1
+PHOTOGRAMMETRIC_FOCAL_SIGMA = 0.1
 """That of the focal length by photographs alone, where EXIF has none and positions are weighed against it."""
-SIGMAS = 3.0
+CONTRADICTION_SIGMAS = 3.0
 """From so many standard deviations on, two sources contradict each other."""
-MARKS = 64
+EXIF_OBSERVATIONS = 64
 """Observations that stand for the focal length of EXIF: many near the axis, where no distortion bends them."""
-LEVEL = 0.02
+MIN_HEIGHT_SPREAD = 0.02
 """Cameras whose heights, less a plane, spread by less than this share of their height above the ground say nothing of
 the focal length: bundle adjustment bends a model by up to a tenth of it."""
-SAMPLE = 100
+SAMPLED_CAMERAS = 100
 """Cameras that tell how far away the ground is."""
-PARALLEL = 0.06
+MAX_PARALLEL_SINE = 0.06
 """Root mean square of the sines between the axes of photographs, below which all look the same way."""
 
 
@@ -60,12 +60,15 @@ class Focal:
         if self.exif is None:
             return False
         alone, final = self.alone / self.exif - 1, self.final / self.exif - 1
-        return alone * final > (SIGMAS * SIGMA) ** 2 or abs(final) > SIGMAS * SIGMA
+        return (
+            alone * final > (CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA) ** 2
+            or abs(final) > CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA
+        )
 
     @property
     def drifts(self) -> bool:
         """Whether, without EXIF, positions draw it so far that the photographs cannot know it."""
-        return self.exif is None and abs(self.final / self.alone - 1) > SIGMAS * SIGMA
+        return self.exif is None and abs(self.final / self.alone - 1) > CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA
 
 
 def exif_focals(model: Any, photos: Mapping[str, Photo]) -> dict[int, float]:
@@ -86,8 +89,12 @@ def known_focals(model: Any, photos: Mapping[str, Photo], alone: bool) -> dict[i
         photos: By name.
         alone: Whether that of the model is taken where EXIF has none.
     """
-    own = {number: (camera.mean_focal_length(), SIGMA_ALONE) for number, camera in model.cameras.items() if alone}
-    return own | {number: (focal, SIGMA) for number, focal in exif_focals(model, photos).items()}
+    own = {
+        number: (camera.mean_focal_length(), PHOTOGRAMMETRIC_FOCAL_SIGMA)
+        for number, camera in model.cameras.items()
+        if alone
+    }
+    return own | {number: (focal, EXIF_FOCAL_SIGMA) for number, focal in exif_focals(model, photos).items()}
 
 
 def add_marks(model: Any, config: Any, focals: Mapping[int, tuple[float, float]]) -> None:
@@ -107,8 +114,8 @@ def add_marks(model: Any, config: Any, focals: Mapping[int, tuple[float, float]]
             continue
         pose, depth = one.cam_from_world(), max(_depth(model, one), 1e-9)
         axes = np.eye(2)[: len(camera.focal_length_idxs())]  # one focal length stands for both
-        t = 1 / (sigma * focal * np.sqrt(MARKS))
-        rays = np.repeat(axes * t, MARKS // 2 // len(axes), 0)
+        t = 1 / (sigma * focal * np.sqrt(EXIF_OBSERVATIONS))
+        rays = np.repeat(axes * t, EXIF_OBSERVATIONS // 2 // len(axes), 0)
         pixels = np.repeat(rays, 2, 0) * focal + (camera.principal_point_x, camera.principal_point_y)
         image = engine.Image(name=f"focal length {camera_id}", keypoints=pixels, camera_id=camera_id, image_id=number)
         frame = engine.Frame(rig_id=one.frame.rig_id, frame_id=max(model.frames) + 1)
@@ -178,7 +185,8 @@ class Weighed:
                 found.append(
                     f"the focal length in EXIF of {focal.photographs} photographs is {focal.exif:.0f} px, that by the "
                     f"photographs alone {focal.alone:.0f} px ({focal.alone / focal.exif - 1:+.0%}; EXIF is taken to be "
-                    f"within {SIGMAS * SIGMA:.0%}); {focal.final:.0f} px are used. If photographs were cropped or EXIF "
+                    f"within {CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA:.0%}); {focal.final:.0f} px are used. If "
+                    f"photographs were cropped or EXIF "
                     "is wrong, remove the focal length from EXIF; otherwise try --lens OPENCV"
                 )
         if self.stretch is not None and self.contradicts:
@@ -189,7 +197,7 @@ class Weighed:
             )
         if self.parallel and not self.knows_heights and not any(focal.contradicts for focal in self.focals):
             has = self.focals[0].exif is not None
-            by = f"known from EXIF only, to {SIGMA:.0%}" if has else "a guess, as EXIF has none"
+            by = f"known from EXIF only, to {EXIF_FOCAL_SIGMA:.0%}" if has else "a guess, as EXIF has none"
             found.append(
                 f"all photographs look the same way, so that they do not tell the focal length: it is {by}, and "
                 "heights above the ground are as exact as it is; add oblique photographs, or check heights with --gcp"
@@ -199,12 +207,14 @@ class Weighed:
     @property
     def contradicts(self) -> bool:
         """Whether heights by GPS contradict those of the cameras, by more than chance and by more than matters."""
-        return self.stretch is not None and abs(self.stretch[0] - 1) > max(SIGMAS * self.stretch[1], SIGMA)
+        return self.stretch is not None and abs(self.stretch[0] - 1) > max(
+            CONTRADICTION_SIGMAS * self.stretch[1], EXIF_FOCAL_SIGMA
+        )
 
     @property
     def knows_heights(self) -> bool:
         """Whether the heights of positions tell the focal length as well as EXIF does."""
-        return self.stretch is not None and self.stretch[1] < SIGMA
+        return self.stretch is not None and self.stretch[1] < EXIF_FOCAL_SIGMA
 
 
 def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[float, float] | None) -> Weighed:
@@ -226,7 +236,7 @@ def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[
     axes = np.stack([final.image(number).cam_from_world().matrix()[2, :3] for number in final.reg_image_ids()])
     middle = axes.mean(0)
     sines = np.linalg.norm(np.cross(axes, middle / max(np.linalg.norm(middle), 1e-9)), axis=1)
-    return Weighed(tuple(focals), heights, bool(np.sqrt((sines**2).mean()) < PARALLEL), stretch)
+    return Weighed(tuple(focals), heights, bool(np.sqrt((sines**2).mean()) < MAX_PARALLEL_SINE), stretch)
 
 
 def height_stretch(
@@ -248,7 +258,7 @@ def height_stretch(
     both = np.column_stack([placed[:, 2], onto[:, 2]]) / sigma[:, None]
     ours, theirs = (both - plane @ np.linalg.lstsq(plane, both, rcond=None)[0]).T
     spread = np.sqrt((ours**2).sum() / (1 / sigma**2).sum())
-    if len(placed) <= plane.shape[1] + 1 or not spread > LEVEL * ground:
+    if len(placed) <= plane.shape[1] + 1 or not spread > MIN_HEIGHT_SPREAD * ground:
         return None
     return float(ours @ theirs / (ours @ ours)), float(1 / np.sqrt(ours @ ours))
 
@@ -256,7 +266,7 @@ def height_stretch(
 def height_above_ground(model: Any) -> float:
     """Median distance of the ground from the cameras, by some of them that are spread over all."""
     numbers = sorted(model.reg_image_ids())
-    some = numbers[:: -(-len(numbers) // SAMPLE)]
+    some = numbers[:: -(-len(numbers) // SAMPLED_CAMERAS)]
     return float(np.median([_depth(model, model.image(number)) for number in some]))
 
 

@@ -22,41 +22,41 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing_folder
 from surfkit.core.optional import needed
 
-RECORD = "frames.json"
+VIDEO_RECORD = "frames.json"
 """What was taken of a video, beside the frames."""
-NAME = re.compile(r"\d{6,}\.jpg")
+FRAME_PATTERN = re.compile(r"\d{6,}\.jpg")
 """Of a frame: its number in the video, from 0."""
-RECIPE = "1"
+CACHE_VERSION = "1"
 """Changes when other frames would be taken of the same video."""
-QUALITY = 95
+JPEG_QUALITY = 95
 """Of JPEG files."""
 FOLLOWED_PX, SHARP_PX = 320, 960
 """Longer side of frames in which corners are followed, and sharpness is measured."""
-CORNERS, FEWEST = 200, 20
+MAX_CORNERS, MIN_CORNERS = 200, 20
 """Corners that are followed; fewer do not tell the movement."""
-MOVED = 0.05
+MAX_CORNER_MOVE_WIDTHS = 0.05
 """Widths that corners have moved by when they are chosen anew."""
-MOVING = 75
+MOTION_PERCENTILE = 75
 """Percentile of the displacements that counts: in a circle about something its middle hardly moves."""
-BACK_PX = 1.0
+MAX_RETURN_PX = 1.0
 """A corner is lost that comes back to another place when it is followed backwards."""
-LOST = 10
+MAX_LOST_FRAMES = 10
 """Frames in a row in which no corner is found again, after which the picture is another one."""
-NEAR = 0.35
+MAX_STEP_OFFSET = 0.35
 """Of a step: a frame is the sharpest of those that are nearer than this to where it should be."""
-AROUND = 15
+SHARPNESS_WINDOW_FRAMES = 15
 """Frames before and after, with which the sharpness of one is compared."""
-BLURRED = 0.6
+MIN_SHARPNESS_RATIO = 0.6
 """A frame is blurred below this share of the upper quartile of the sharpness around it."""
-WIDE = 0.3
+MAX_STEP_WIDTHS = 0.3
 """Share of the width that the picture moves by between two frames, beyond which few places are in four of them."""
 CONVERT = "convert it to MP4 with H.264, or take frames with ffmpeg"
-WHOLE = 0.95
+MIN_FRAME_SHARE = 0.95
 """A video with less than this share of the frames that its head names is cut off."""
 
 
 @dataclass(frozen=True)
-class Taken:
+class ExtractedFrames:
     """Frames that were taken of a video.
 
     Attributes:
@@ -92,7 +92,7 @@ def require_opencv(video: Path) -> Any:
     return cv2
 
 
-def take_frames(video: Path, folder: Path, step: float, most: int) -> Taken:
+def take_frames(video: Path, folder: Path, step: float, most: int) -> ExtractedFrames:
     """Take frames of a video into a folder, unless an earlier call has with the same settings.
 
     Args:
@@ -105,9 +105,9 @@ def take_frames(video: Path, folder: Path, step: float, most: int) -> Taken:
         BadInput: OpenCV is missing or cannot read it.
     """
     stat = video.stat()
-    key = f"{RECIPE} {QUALITY} {stat.st_size} {stat.st_mtime_ns} {step} {most}"
+    key = f"{CACHE_VERSION} {JPEG_QUALITY} {stat.st_size} {stat.st_mtime_ns} {step} {most}"
     try:
-        before = read_json(folder / RECORD, Taken)
+        before = read_json(folder / VIDEO_RECORD, ExtractedFrames)
     except BadInput:
         before = None
     if before is not None and before.key == key and all(_is_there(folder, name) for name in before.names):
@@ -120,10 +120,10 @@ def take_frames(video: Path, folder: Path, step: float, most: int) -> Taken:
     names = tuple(f"{at:0{digits}}.jpg" for at in chosen)
     with replacing_folder(folder) as made:
         for done, (name, frame) in enumerate(zip(names, _frames(cv2, video, chosen), strict=True), 1):
-            Image.fromarray(frame[..., ::-1]).save(made / name, "JPEG", quality=QUALITY, subsampling=0)
+            Image.fromarray(frame[..., ::-1]).save(made / name, "JPEG", quality=JPEG_QUALITY, subsampling=0)
             emit(Progress(f"taking frames of {video.name}", done, len(names)))
-        taken = Taken(key, len(track.way), step, names)
-        write_json(made / RECORD, taken)
+        taken = ExtractedFrames(key, len(track.way), step, names)
+        write_json(made / VIDEO_RECORD, taken)
     _tell(video, taken)
     return taken
 
@@ -143,24 +143,26 @@ def follow(cv2: Any, video: Path) -> Track:
             places = anchors
         else:
             found, kept = _followed(cv2, before, small, places)
-            if kept.sum() >= min(FEWEST, max(len(places), 1)):
+            if kept.sum() >= min(MIN_CORNERS, max(len(places), 1)):
                 before, anchors, places, lost = small, anchors[kept], found[kept], 0
-                moved = float(np.percentile(np.linalg.norm(places - anchors, axis=1), MOVING)) / small.shape[1]
+                moved = (
+                    float(np.percentile(np.linalg.norm(places - anchors, axis=1), MOTION_PERCENTILE)) / small.shape[1]
+                )
                 way.append(start + moved)
-                if moved > MOVED or len(places) < CORNERS // 4:
+                if moved > MAX_CORNER_MOVE_WIDTHS or len(places) < MAX_CORNERS // 4:
                     start, anchors = way[-1], _corners(cv2, small)
                     places = anchors
             else:  # a blurred frame, or another scene
                 lost += 1
                 way.append(way[-1])
-                if lost > LOST or not len(places):
-                    start, lost, before, anchors = way[-1] + MOVED, 0, small, _corners(cv2, small)
+                if lost > MAX_LOST_FRAMES or not len(places):
+                    start, lost, before, anchors = way[-1] + MAX_CORNER_MOVE_WIDTHS, 0, small, _corners(cv2, small)
                     way[-1], places = start, anchors
         if at % 25 == 0 and total > 0:
             emit(Progress(f"looking at {video.name}", min(at + 1, total), total))
     if not sharpness:
         raise BadInput(f"{video}: OpenCV finds no frame in it; {CONVERT}")
-    if len(sharpness) < WHOLE * total:
+    if len(sharpness) < MIN_FRAME_SHARE * total:
         emit(Warned(f"{video}: ends after {len(sharpness)} of {total} frames: it is cut off or damaged there"))
     emit(Progress(f"looking at {video.name}", len(sharpness), len(sharpness)))
     return Track(np.array(way), np.array(sharpness))
@@ -170,14 +172,19 @@ def choose(track: Track, step: float, most: int) -> tuple[list[int], float]:
     """Positions of the frames to take, in order: the sharpest near each step of the way, none that is blurred; and the
     step, which becomes larger where these would be more than `most`."""
     count = len(track.way)
-    usual = np.array([np.percentile(track.sharpness[max(0, at - AROUND) : at + AROUND + 1], 75) for at in range(count)])
-    good = np.flatnonzero(track.sharpness >= BLURRED * usual)
+    usual = np.array(
+        [
+            np.percentile(track.sharpness[max(0, at - SHARPNESS_WINDOW_FRAMES) : at + SHARPNESS_WINDOW_FRAMES + 1], 75)
+            for at in range(count)
+        ]
+    )
+    good = np.flatnonzero(track.sharpness >= MIN_SHARPNESS_RATIO * usual)
     way, sharpness = track.way[good], track.sharpness[good]
     while True:
         chosen, target = [], way[0]
         while True:
-            near = np.flatnonzero(np.abs(way - target) <= NEAR * step)
-            beyond = np.flatnonzero(way > target + NEAR * step)
+            near = np.flatnonzero(np.abs(way - target) <= MAX_STEP_OFFSET * step)
+            beyond = np.flatnonzero(way > target + MAX_STEP_OFFSET * step)
             if len(near):
                 at = near[sharpness[near].argmax()]
             elif len(beyond):
@@ -193,13 +200,13 @@ def choose(track: Track, step: float, most: int) -> tuple[list[int], float]:
 
 def _is_there(folder: Path, name: str) -> bool:
     """Whether a frame lies in a folder, and not elsewhere."""
-    return NAME.fullmatch(name) is not None and (folder / name).is_file()
+    return FRAME_PATTERN.fullmatch(name) is not None and (folder / name).is_file()
 
 
-def _tell(video: Path, taken: Taken) -> None:
+def _tell(video: Path, taken: ExtractedFrames) -> None:
     """Say how many frames were taken, and whether they overlap."""
     said = f"{video}: {len(taken.names)} of {taken.frames} frames are taken, one each time that the picture moves by"
-    wide = ", so that they hardly overlap; give more --frames" if taken.step > WIDE else ""
+    wide = ", so that they hardly overlap; give more --frames" if taken.step > MAX_STEP_WIDTHS else ""
     emit(Warned(f"{said} {taken.step:.0%} of its width{wide}"))
 
 
@@ -242,7 +249,7 @@ def _sharpness(cv2: Any, grey: np.ndarray) -> float:
 
 def _corners(cv2: Any, grey: np.ndarray) -> np.ndarray:
     """(C, 2) float32 of corners, spread over the picture."""
-    found = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, max(grey.shape) / 50)
+    found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, 0.01, max(grey.shape) / 50)
     return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
 
@@ -253,4 +260,4 @@ def _followed(cv2: Any, before: np.ndarray, now: np.ndarray, places: np.ndarray)
     there, seen, _ = cv2.calcOpticalFlowPyrLK(before, now, places.reshape(-1, 1, 2), None)
     back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, there, None)
     off = np.linalg.norm(back.reshape(-1, 2) - places, axis=1)
-    return there.reshape(-1, 2), (seen.ravel() == 1) & (again.ravel() == 1) & (off < BACK_PX)
+    return there.reshape(-1, 2), (seen.ravel() == 1) & (again.ravel() == 1) & (off < MAX_RETURN_PX)

@@ -9,32 +9,32 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import Hand
-from surfkit.apps.sfm.similarity import FEWEST, Fit, fit_robustly
+from surfkit.apps.sfm.plausible import Handedness
+from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS, SimilarityFit, fit_robustly
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.georeference import Similarity
-from surfkit.scene.crs import BESIDE, DEGREES, POLAR, axes_of, exact, parsed, zone_of
-from surfkit.scene.earth import Site, utm
+from surfkit.scene.crs import LATLON_CRS, MAX_UTM_LATITUDE, MAX_UTM_OFFSET_DEGREES, axes_of, exact, parsed, zone_of
+from surfkit.scene.earth import LocalEarthFrame, utm
 
-GRAIN_M = 100.0
+OFFSET_GRAIN_M = 100.0
 """Offsets are multiples of it."""
-MOST_TURN = 0.05
+MAX_TURN_ERROR = 0.05
 """Standard error of the turn and the scale, as a share: beyond it positions do not determine them."""
-LINE = 0.05
+MAX_LINE_SPREAD_RATIO = 0.05
 """Positions lie along a line where they spread across it by less than this share of the spread along it."""
-LEAST_SIGMA_M = 0.01
+MIN_SIGMA_M = 0.01
 """No position is trusted more."""
 ASSUMED_M = 3.0
 """Standard deviation of each coordinate of a position that states none, beside others that do."""
 NEAR_M = 0.1
 """A residual below it is not held against a position, nor half of it against a control point."""
-METRIC = 0.01
+MAX_METRE_DIFFERENCE = 0.01
 """Units that differ from a metre by less are metres, as those of projections are."""
 
 
 @dataclass(frozen=True)
-class Chart:
+class MapProjection:
     """A map that positions are put on.
 
     Attributes:
@@ -49,7 +49,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Refused:
+class NoSimilarity:
     """No similarity: why, in half a sentence."""
 
     reason: str
@@ -72,18 +72,18 @@ class Placement:
             `onto` are of the cameras.
     """
 
-    chart: Chart
+    chart: MapProjection
     similarity: Similarity
     names: tuple[str, ...]
     onto: np.ndarray
-    fit: Fit
+    fit: SimilarityFit
     sigma: np.ndarray
     handed: bool = False
     plan: bool = False
 
 
 @dataclass(frozen=True)
-class Level:
+class Levelling:
     """How a reconstruction stands level, for positions that have no altitudes.
 
     Attributes:
@@ -95,7 +95,7 @@ class Level:
     ground: float
 
 
-def chart_of(positions: np.ndarray, crs: str) -> Chart:
+def chart_of(positions: np.ndarray, crs: str) -> MapProjection:
     """The map for positions, its offset near them.
 
     Args:
@@ -109,11 +109,11 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
     plan = np.column_stack([positions[:, 0], _unbroken(positions[:, 1])])
     middle = np.append(np.median(plan, axis=0), np.median(heights) if len(heights) else 0.0)
     if crs == "auto":
-        if abs(middle[0]) > POLAR:
+        if abs(middle[0]) > MAX_UTM_LATITUDE:
             raise BadInput(f"at latitude {middle[0]:.2f} there is no UTM; name a system with --crs, such as EPSG:3995")
         zone = int((middle[1] + 180) // 6) % 60 + 1
         crs = f"EPSG:{(32700 if middle[0] < 0 else 32600) + zone}"
-    placed = to_chart(Chart(crs, (0.0, 0.0, 0.0)), middle[None])[0]
+    placed = to_chart(MapProjection(crs, (0.0, 0.0, 0.0)), middle[None])[0]
     if not np.isfinite(placed).all():
         raise BadInput(
             f"--crs {crs}: it does not reach {middle[0]:.4f}, {middle[1]:.4f} (latitude, longitude), the middle of the "
@@ -122,21 +122,21 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
     return chart_about(crs, placed)
 
 
-def chart_about(crs: str, placed: np.ndarray) -> Chart:
+def chart_about(crs: str, placed: np.ndarray) -> MapProjection:
     """The map about (3,) a place on it, its offset near it; BadInput for one that is not of east, north and up."""
-    unit = Site.at(crs, placed).unit
-    metres = 1.0 if abs(unit - 1) < METRIC else axes_of(crs).metres
-    east, north = (float(np.round(value / GRAIN_M) * GRAIN_M) for value in placed[:2])
-    return Chart(crs, (east, north, 0.0), metres)
+    unit = LocalEarthFrame.at(crs, placed).unit
+    metres = 1.0 if abs(unit - 1) < MAX_METRE_DIFFERENCE else axes_of(crs).metres
+    east, north = (float(np.round(value / OFFSET_GRAIN_M) * OFFSET_GRAIN_M) for value in placed[:2])
+    return MapProjection(crs, (east, north, 0.0), metres)
 
 
-def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
+def to_chart(chart: MapProjection, positions: np.ndarray) -> np.ndarray:
     """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes. East and north that
     are not finite say that the map does not reach them; a height is not finite where the altitude is not known."""
     zone = zone_of(chart.crs)
     if zone is not None:
         away = np.abs((positions[:, 1] - (6 * zone[0] - 183) + 180) % 360 - 180)
-        reached = (np.abs(positions[:, 0]) <= POLAR) & (away < BESIDE)
+        reached = (np.abs(positions[:, 0]) <= MAX_UTM_LATITUDE) & (away < MAX_UTM_OFFSET_DEGREES)
         flat = np.full((len(positions), 2), np.nan)
         flat[reached] = np.array([utm(*row, *zone) for row in positions[reached, :2].tolist()]).reshape(-1, 2)
     else:
@@ -145,8 +145,12 @@ def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
 
 
 def place(
-    centres: Mapping[str, np.ndarray], photos: Sequence[Photo], chart: Chart, seed: int = 0, level: Level | None = None
-) -> Placement | Refused:
+    centres: Mapping[str, np.ndarray],
+    photos: Sequence[Photo],
+    chart: MapProjection,
+    seed: int = 0,
+    level: Levelling | None = None,
+) -> Placement | NoSimilarity:
     """The similarity that brings camera centres to the positions of their photographs.
 
     Positions without an altitude are left out. Where what is left determines no similarity, all positions give one in
@@ -165,14 +169,16 @@ def place(
     if far := [photo.name for photo, good in zip(given, reached, strict=True) if not good]:
         emit(Warned(f"{len(far)} positions are where {chart.crs} does not reach, and are left out: {few(far)}"))
     known, onto = [photo for photo, good in zip(given, reached, strict=True) if good], onto[reached]
-    if len(known) < FEWEST:
-        return Refused(f"{len(known)} of {len(centres)} placed photographs have a position, {FEWEST} are needed")
+    if len(known) < MIN_AGREEING_POSITIONS:
+        return NoSimilarity(
+            f"{len(known)} of {len(centres)} placed photographs have a position, {MIN_AGREEING_POSITIONS} are needed"
+        )
     xyz = np.stack([centres[photo.name] for photo in known])
     high = np.isfinite(onto[:, 2])
-    found: Placement | Refused = Refused(
-        f"{high.sum()} of {len(known)} positions have an altitude, {FEWEST} are needed"
+    found: Placement | NoSimilarity = NoSimilarity(
+        f"{high.sum()} of {len(known)} positions have an altitude, {MIN_AGREEING_POSITIONS} are needed"
     )
-    if high.sum() >= FEWEST:
+    if high.sum() >= MIN_AGREEING_POSITIONS:
         found = _fitted(
             [photo for photo, good in zip(known, high, strict=True) if good], xyz[high], onto[high], chart, seed
         )
@@ -182,46 +188,48 @@ def place(
 
 
 def _fitted(
-    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: Chart, seed: int, axes: int = 3
-) -> Placement | Refused:
+    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: MapProjection, seed: int, axes: int = 3
+) -> Placement | NoSimilarity:
     """The similarity of (P, 3) camera centres to (P, 3) places on the map, of which the first `axes` axes count."""
     stated = np.array([photo.exif.accuracy_m or (np.nan,) * 3 for photo in known], np.float64)
-    stated = np.maximum(stated, LEAST_SIGMA_M) / chart.metres
+    stated = np.maximum(stated, MIN_SIGMA_M) / chart.metres
     silent = np.isnan(stated[:, 0])
     assumed = np.where(silent, ASSUMED_M / chart.metres, np.linalg.norm(stated[:, :axes], axis=1) / np.sqrt(axes))
     fit = fit_robustly(xyz, onto, None if silent.all() else assumed, seed, NEAR_M / chart.metres)
     if fit is None:
-        return Refused(f"of {len(known)} positions fewer than {FEWEST} agree with the cameras")
+        return NoSimilarity(f"of {len(known)} positions fewer than {MIN_AGREEING_POSITIONS} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
     along, across = fit.similarity.scale * spread[:2] / np.sqrt(fit.inside.sum()) * chart.metres
     if along < NEAR_M:
-        return Refused(f"{int(fit.inside.sum())} of {len(known)} positions are one place")
-    if across < LINE * along:
-        return Refused(f"positions lie along a line: they spread by {along:.1f} m along it and {across:.2f} m across")
-    if not fit.turn_error(xyz) * np.sqrt(3 / axes) <= MOST_TURN:
+        return NoSimilarity(f"{int(fit.inside.sum())} of {len(known)} positions are one place")
+    if across < MAX_LINE_SPREAD_RATIO * along:
+        return NoSimilarity(
+            f"positions lie along a line: they spread by {along:.1f} m along it and {across:.2f} m across"
+        )
+    if not fit.turn_error(xyz) * np.sqrt(3 / axes) <= MAX_TURN_ERROR:
         rms = float(np.linalg.norm(fit.sigma)) * chart.metres
-        return Refused(
+        return NoSimilarity(
             f"residuals of {rms:.1f} m are too large for positions that spread by {along:.1f} and {across:.1f} m"
         )
-    hand = Hand.of(xyz[fit.inside], onto[fit.inside], NEAR_M / chart.metres)
+    hand = Handedness.of(xyz[fit.inside], onto[fit.inside], NEAR_M / chart.metres)
     if hand.wrong:
         mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
-        return Refused(
+        return NoSimilarity(
             f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m: latitude and longitude are exchanged "
             "or have a wrong sign, or heights count down"
         )
-    own = np.maximum(fit.deviation(silent), LEAST_SIGMA_M / chart.metres)
+    own = np.maximum(fit.deviation(silent), MIN_SIGMA_M / chart.metres)
     sigma = np.where(silent[:, None], own, stated)
     return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right)
 
 
 def _in_plan(
-    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: Chart, seed: int, level: Level
-) -> Placement | Refused:
+    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: MapProjection, seed: int, level: Levelling
+) -> Placement | NoSimilarity:
     """The similarity in plan, by latitudes and longitudes alone, of a model that is made level."""
     flat = np.array([1.0, 1.0, 0.0])
     found = _fitted(known, xyz @ level.turn.T * flat, np.nan_to_num(onto) * flat, chart, seed, axes=2)
-    if isinstance(found, Refused):
+    if isinstance(found, NoSimilarity):
         return found
     turned = found.similarity  # about z, or about a level axis where the positions are mirrored
     sink = turned.scale * turned.turn @ (0.0, 0.0, level.ground)
@@ -242,7 +250,7 @@ def _by_pyproj(crs: str, positions: np.ndarray) -> np.ndarray:
         flat = parsed(crs).to_2d()
     except BadInput as error:
         raise BadInput(f"--crs: {error}; name one such as EPSG:2180") from error
-    known = exact(DEGREES, flat)
+    known = exact(LATLON_CRS, flat)
     if known is None:
         raise BadInput(f"--crs {crs}: the shift from WGS 84 to its datum is not known; name another, such as EPSG:2180")
     return np.stack(known.transform(positions[:, 1], positions[:, 0]), axis=1)

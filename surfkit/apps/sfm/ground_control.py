@@ -12,21 +12,30 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
+from surfkit.apps.sfm.georeference import (
+    MAX_LINE_SPREAD_RATIO,
+    MAX_TURN_ERROR,
+    NEAR_M,
+    MapProjection,
+    NoSimilarity,
+    chart_about,
+    chart_of,
+    to_chart,
+)
 from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import FAR_M, HIGH_M, LOW_M, Hand
-from surfkit.apps.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
+from surfkit.apps.sfm.plausible import MAX_ALTITUDE_ERROR_M, MAX_POSITION_ERROR_M, MIN_LAND_M, Handedness
+from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS, PARAMETERS, fit_robustly, umeyama
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.georeference import Similarity
 from surfkit.io.datasets.systems import system_of
 
-FEWEST_POINTS, FEWEST_VIEWS = 3, 2
+MIN_CONTROL_POINTS, MIN_POINT_PHOTOS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
 
 
 @dataclass(frozen=True)
-class GroundPoint:
+class GroundControlPoint:
     """A place on the map that photographs show.
 
     Attributes:
@@ -41,7 +50,7 @@ class GroundPoint:
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundControl:
     """Ground control points on a map.
 
     Attributes:
@@ -50,13 +59,13 @@ class Ground:
         onto: (P, 3) their places less the offset.
     """
 
-    points: Sequence[GroundPoint]
-    chart: Chart
+    points: Sequence[GroundControlPoint]
+    chart: MapProjection
     onto: np.ndarray
 
 
 @dataclass(frozen=True)
-class Control:
+class ControlResiduals:
     """Control points of a model on the map.
 
     Attributes:
@@ -70,7 +79,7 @@ class Control:
         handed: Whether they are told from their mirror image: they are not all in a plane.
     """
 
-    chart: Chart
+    chart: MapProjection
     similarity: Similarity
     residuals: Mapping[str, tuple[float, float, float]]
     control: tuple[str, ...]
@@ -99,7 +108,7 @@ class Control:
         return dict(zip("enu", np.sqrt((rows**2).mean(0)).round(3).tolist(), strict=True))
 
 
-def read_list(path: Path) -> tuple[str, list[GroundPoint]]:
+def read_list(path: Path) -> tuple[str, list[GroundControlPoint]]:
     """The coordinate reference system of a list, and its points in their order.
 
     Raises:
@@ -114,7 +123,7 @@ def read_list(path: Path) -> tuple[str, list[GroundPoint]]:
     rows = [(at, line.strip()) for at, line in enumerate(lines, 1) if line.strip() and not line.strip().startswith("#")]
     if not rows:
         raise BadInput(f"--gcp {path}: empty; its first line is a coordinate reference system, such as EPSG:32633")
-    found: dict[str, GroundPoint] = {}
+    found: dict[str, GroundControlPoint] = {}
     for at, line in rows[1:]:
         words = line.split()
         try:
@@ -128,7 +137,7 @@ def read_list(path: Path) -> tuple[str, list[GroundPoint]]:
         name = (
             words[6] if len(words) > 6 else next((p.name for p in found.values() if p.xyz == (x, y, z)), f"line {at}")
         )
-        point = found.get(name, GroundPoint(name, (x, y, z), {}))
+        point = found.get(name, GroundControlPoint(name, (x, y, z), {}))
         if point.xyz != (x, y, z):
             raise BadInput(
                 f"--gcp {path}: line {at} puts {name!r} elsewhere than a line before; one place for each name"
@@ -137,7 +146,7 @@ def read_list(path: Path) -> tuple[str, list[GroundPoint]]:
     return rows[0][1], list(found.values())
 
 
-def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], held_back: int = 0) -> Ground:
+def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], held_back: int = 0) -> GroundControl:
     """The points of a list on their map.
 
     Args:
@@ -151,12 +160,13 @@ def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], h
     """
     crs, listed = read_list(path)
     points = _marked(path, listed, sizes)
-    enough = sum(len(point.marks) >= FEWEST_VIEWS for point in points)
-    if enough < FEWEST_POINTS + held_back:
+    enough = sum(len(point.marks) >= MIN_POINT_PHOTOS for point in points)
+    if enough < MIN_CONTROL_POINTS + held_back:
         also = f" besides {held_back} --checkpoints" if held_back else ""
         raise BadInput(
-            f"--gcp {path}: {enough} of its {len(points)} points are marked in {FEWEST_VIEWS} or more photographs of "
-            f"the folder; {FEWEST_POINTS} are needed{also}"
+            f"--gcp {path}: {enough} of its {len(points)} points are marked in {MIN_POINT_PHOTOS} or more "
+            f"photographs of "
+            f"the folder; {MIN_CONTROL_POINTS} are needed{also}"
         )
     xyz = np.array([point.xyz for point in points], np.float64)
     try:
@@ -174,7 +184,7 @@ def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], h
         onto = to_chart(chart, positions)
         if not np.isfinite(onto).all():
             raise BadInput(f"--gcp {path}: some points are where {chart.crs} does not reach; x is the longitude")
-        return Ground(points, chart, onto)
+        return GroundControl(points, chart, onto)
     crs = system.crs
     if wanted not in ("auto", crs):
         raise BadInput(f"--crs {wanted}: the list of --gcp is in {crs}, and the scene will be; leave --crs out")
@@ -182,10 +192,12 @@ def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], h
         chart = chart_about(crs, np.median(xyz, axis=0))
     except BadInput as error:
         raise BadInput(f"--gcp {path}: {error} (line 1 names the system; x is east and y north in it)") from error
-    return Ground(points, chart, xyz - chart.offset)
+    return GroundControl(points, chart, xyz - chart.offset)
 
 
-def _marked(path: Path, points: Sequence[GroundPoint], sizes: Mapping[str, tuple[int, int]]) -> Sequence[GroundPoint]:
+def _marked(
+    path: Path, points: Sequence[GroundControlPoint], sizes: Mapping[str, tuple[int, int]]
+) -> Sequence[GroundControlPoint]:
     """The points of a list with the full names of the photographs that show them, and without unknown ones."""
     folders: dict[str, list[str]] = {}
     for name in sizes:
@@ -222,7 +234,7 @@ def _marked(path: Path, points: Sequence[GroundPoint], sizes: Mapping[str, tuple
     return found
 
 
-def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Refused:
+def place_by_points(model: Any, ground: GroundControl, held_back: int) -> ControlResiduals | NoSimilarity:
     """The similarity that brings control points to their places.
 
     Args:
@@ -236,38 +248,42 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     seen = [at for at, xyz in enumerate(placed) if xyz is not None]
     unseen = tuple(point.name for at, point in enumerate(points) if at not in set(seen))
     spread = np.linspace(0, len(seen) - 1, held_back + 2).round().astype(int)[1:-1] if held_back else []
-    back = {seen[at] for at in spread} if len(seen) >= FEWEST_POINTS + held_back else None
+    back = {seen[at] for at in spread} if len(seen) >= MIN_CONTROL_POINTS + held_back else None
     if back is None:
         also = f" besides {held_back} checkpoints" if held_back else ""
-        return Refused(
-            f"{len(seen)} of {len(points)} ground control points are in {FEWEST_VIEWS} placed photographs or more, "
-            f"{FEWEST_POINTS} are needed{also}"
+        return NoSimilarity(
+            f"{len(seen)} of {len(points)} ground control points are in {MIN_POINT_PHOTOS} placed photographs or more, "
+            f"{MIN_CONTROL_POINTS} are needed{also}"
         )
     control = [at for at in seen if at not in back]
     xyz = np.stack([placed[at] for at in control])
-    fit = fit_robustly(xyz, onto[control], least=NEAR_M / 2 / chart.metres) if len(control) > FEWEST else None
+    fit = (
+        fit_robustly(xyz, onto[control], least=NEAR_M / 2 / chart.metres)
+        if len(control) > MIN_AGREEING_POSITIONS
+        else None
+    )
     inside = np.ones(len(control), bool) if fit is None else fit.inside
     given = umeyama(xyz, onto[control], np.ones(len(control))) if fit is None else fit.similarity
     sizes = np.linalg.svd(xyz[inside] - xyz[inside].mean(0), compute_uv=False)
     left = (onto[seen] - given.points(np.stack([placed[at] for at in seen]))) * chart.metres
-    if not sizes[1] > LINE * sizes[0]:
-        return Refused("ground control points lie along a line")
-    hand = Hand.of(xyz[inside], onto[control][inside], NEAR_M / chart.metres)
+    if not sizes[1] > MAX_LINE_SPREAD_RATIO * sizes[0]:
+        return NoSimilarity("ground control points lie along a line")
+    hand = Handedness.of(xyz[inside], onto[control][inside], NEAR_M / chart.metres)
     if hand.wrong:
         mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
-        return Refused(
+        return NoSimilarity(
             f"ground control points fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m; x must be east and y "
             "north, and heights count up"
         )
     residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
     rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
     across = given.scale * sizes[1] * chart.metres
-    if rms / np.sqrt(3) > MOST_TURN * across:
-        return Refused(
+    if rms / np.sqrt(3) > MAX_TURN_ERROR * across:
+        return NoSimilarity(
             f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points that spread by "
             f"{across / np.sqrt(len(residuals)):.1f} m"
         )
-    return Control(
+    return ControlResiduals(
         chart,
         given,
         {points[at].name: tuple(row) for at, row in zip(seen, left.tolist(), strict=True)},
@@ -279,7 +295,7 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     )
 
 
-def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence[Photo]) -> list[str]:
+def doubts(control: ControlResiduals, centres: Mapping[str, np.ndarray], photos: Sequence[Photo]) -> list[str]:
     """What else is known of the photographs and contradicts the control points, a line for each.
 
     Args:
@@ -289,7 +305,7 @@ def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence
     """
     found, metres = [], control.chart.metres
     low = float(np.median(control.similarity.points(np.stack(list(centres.values())))[:, 2])) * metres
-    if low < LOW_M:
+    if low < MIN_LAND_M:
         found.append(
             f"the ground control points put the photographs {-low:.0f} m below zero, where little land is: do the "
             "heights of the list count up?"
@@ -303,13 +319,13 @@ def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence
     across = np.linalg.norm(away[:, :2], axis=1)
     across = float(np.median(np.where(np.isfinite(across), across, np.inf)))
     rise = float(np.median(away[np.isfinite(away[:, 2]), 2])) if np.isfinite(away[:, 2]).any() else 0.0
-    if across > FAR_M:
+    if across > MAX_POSITION_ERROR_M:
         far = f"{across / 1000:.0f} km" if np.isfinite(across) else "out of reach"
         found.append(
             f"the ground control points put the photographs {far} from their positions in EXIF: is {control.chart.crs} "
             "the system of the list, with x east and y north?"
         )
-    elif abs(rise) > HIGH_M:
+    elif abs(rise) > MAX_ALTITUDE_ERROR_M:
         found.append(
             f"the ground control points put the photographs {abs(rise):.0f} m {'above' if rise > 0 else 'below'} their "
             "altitudes in EXIF: do the heights of the list count up, in the unit of its system?"
@@ -332,7 +348,7 @@ def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, floa
         direction = np.append(np.asarray(image.camera.cam_from_img(np.array([pixel], np.float64))).ravel()[:2], 1.0)
         direction = np.array(image.cam_from_world().rotation.matrix()).T @ direction
         rays.append((np.array(image.projection_center()), direction / np.linalg.norm(direction)))
-    if len(rays) < FEWEST_VIEWS:
+    if len(rays) < MIN_POINT_PHOTOS:
         return None
     point, weights = np.zeros(3), np.ones(len(rays))
     for _ in range(3):

@@ -15,9 +15,9 @@ from surfkit.apps.sfm.base import FeatureExtractor, Features, Find
 from surfkit.apps.sfm.weights import load_kornia, network_of
 from surfkit.core.check import require_within
 
-HALF = 0.5
+HALF_PIXEL = 0.5
 """From kornia's pixels, whose middles are whole numbers, to COLMAP's."""
-FRAME = 6.0
+FRAME_SIGMAS = 6.0
 """Times the standard deviation of a blob is the size of its frame in kornia."""
 
 
@@ -54,9 +54,9 @@ class KorniaSIFT(FeatureExtractor):
                 frames, strength, descriptors = network(grey)
                 kept = kornia.laf_is_filled(frames)[0] & (strength[0] >= self.contrast)
                 frames = frames[:, kept]
-                size = kornia.get_laf_scale(frames)[0, :, 0] / FRAME
+                size = kornia.get_laf_scale(frames)[0, :, 0] / FRAME_SIGMAS
                 turn = -kornia.get_laf_orientation(frames)[0] * (math.pi / 180)
-                keypoints = torch.cat([frames[0, :, :, 2] + HALF, size, turn], 1)
+                keypoints = torch.cat([frames[0, :, :, 2] + HALF_PIXEL, size, turn], 1)
                 small = (512 * descriptors[0, kept]).round().clamp(0, 255).byte()  # as COLMAP does
             return Features(keypoints.float().cpu().numpy(), small.cpu().numpy())
 
@@ -149,6 +149,6 @@ class ALIKED(FeatureExtractor):
 
 def _features(found: Any) -> Features:
     """Features without scale and orientation, as COLMAP counts pixels."""
-    at = found.keypoints.float().cpu().numpy().reshape(-1, 2) + HALF
+    at = found.keypoints.float().cpu().numpy().reshape(-1, 2) + HALF_PIXEL
     keypoints = np.column_stack([at, np.ones(len(at)), np.zeros(len(at))]).astype(np.float32)
     return Features(keypoints, found.descriptors.half().cpu().numpy())

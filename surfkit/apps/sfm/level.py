@@ -9,11 +9,11 @@ import numpy as np
 
 from surfkit.apps.sfm.photographs import Photo
 
-RIGHT = {1: (1, 0), 2: (-1, 0), 3: (-1, 0), 4: (1, 0), 5: (0, 1), 6: (0, -1), 7: (0, -1), 8: (0, 1)}
+RIGHT_DIRECTIONS = {1: (1, 0), 2: (-1, 0), 3: (-1, 0), 4: (1, 0), 5: (0, 1), 6: (0, -1), 7: (0, -1), 8: (0, 1)}
 """By orientation in EXIF: where the right of the upright picture is, along x and y of the stored pixels."""
-TOP = {1: (0, -1), 2: (0, -1), 3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+TOP_DIRECTIONS = {1: (0, -1), 2: (0, -1), 3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """By orientation in EXIF: where its top is."""
-PARALLEL = 0.02
+MAX_PARALLEL_SINE_SQUARED = 0.02
 """Mean square of the sines between the right sides of photographs, below which they all point the same way."""
 
 
@@ -28,14 +28,14 @@ def up_direction(poses: np.ndarray, orientations: Sequence[int], points: np.ndar
         orientations: (V,) of EXIF.
         points: (P, 3) world frame.
     """
-    flat = np.array([(*RIGHT[number], 0) for number in orientations], np.float64)
-    tops = np.array([(*TOP[number], 0) for number in orientations], np.float64)
+    flat = np.array([(*RIGHT_DIRECTIONS[number], 0) for number in orientations], np.float64)
+    tops = np.array([(*TOP_DIRECTIONS[number], 0) for number in orientations], np.float64)
     turns = poses[:, :3, :3]
     right = np.einsum("vji,vj->vi", turns, flat)
     above = np.einsum("vji,vj->vi", turns, tops) - turns[:, 2]  # against the view, for cameras that look down
     values, axes = np.linalg.eigh(right.T @ right / len(right))
     up = axes[:, 0]
-    if values[1] < PARALLEL and len(points) > 3:
+    if values[1] < MAX_PARALLEL_SINE_SQUARED and len(points) > 3:
         away = points - np.median(points, axis=0)
         near = np.linalg.norm(away, axis=1) <= np.percentile(np.linalg.norm(away, axis=1), 90)
         thin = np.linalg.eigh(away[near].T @ away[near])[1][:, 0]

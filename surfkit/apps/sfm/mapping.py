@@ -16,9 +16,9 @@ from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing_folder
 from surfkit.io.datasets.colmap_files import refuse_cut_off
 
-SMALLEST = 3
+MIN_MODEL_PHOTOS = 3
 """Photographs of a model; fewer determine no surface."""
-GRAIN = 2.0**-26
+MODEL_ROUNDING = 2.0**-26
 """To which models are rounded, whose cameras spread by some 10 units: less than 1e-3 px. Threads add up in another
 order each time, which changes the last bits, by 1e-14; rounded, nearly all come to the same bits."""
 
@@ -39,7 +39,7 @@ def map_photographs(database: Path, folder: Path, count: int, settings: Settings
         place = _incremental if settings.mapper == "incremental" else _global
         models = place(engine, database, scratch, count, settings)
         order = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-        kept = [model for model in order if model.num_reg_images() >= SMALLEST and model.num_points3D()]
+        kept = [model for model in order if model.num_reg_images() >= MIN_MODEL_PHOTOS and model.num_points3D()]
         for number, model in enumerate(kept):
             (made / str(number)).mkdir()
             for image in model.images.values():
@@ -53,10 +53,10 @@ def map_photographs(database: Path, folder: Path, count: int, settings: Settings
 
 
 def round_off(engine: Any, model: Any) -> None:
-    """Round cameras, poses and points of a pycolmap.Reconstruction to multiples of `GRAIN`."""
+    """Round cameras, poses and points of a pycolmap.Reconstruction to multiples of `MODEL_ROUNDING`."""
 
     def rounded(values: Any) -> np.ndarray:
-        return np.round(np.asarray(values, np.float64) / GRAIN) * GRAIN
+        return np.round(np.asarray(values, np.float64) / MODEL_ROUNDING) * MODEL_ROUNDING
 
     for camera in model.cameras.values():
         camera.params = rounded(camera.params)
@@ -81,7 +81,7 @@ def read_model(folder: Path) -> Any:
 
 def _incremental(engine: Any, database: Path, folder: Path, count: int, settings: Settings) -> dict[int, Any]:
     options = engine.IncrementalPipelineOptions()
-    options.min_model_size = SMALLEST
+    options.min_model_size = MIN_MODEL_PHOTOS
     options.random_seed = settings.seed
     options.extract_colors = False  # photographs are read once, when they are undistorted
     placed = 0
@@ -104,7 +104,7 @@ def _incremental(engine: Any, database: Path, folder: Path, count: int, settings
 
 def _global(engine: Any, database: Path, folder: Path, count: int, settings: Settings) -> dict[int, Any]:
     options = engine.GlobalPipelineOptions()
-    options.min_model_size = SMALLEST
+    options.min_model_size = MIN_MODEL_PHOTOS
     options.random_seed = settings.seed
     emit(Progress("placing cameras", 0, count))
     models = run("placing cameras", lambda token: engine.global_mapping(database, folder, folder, options))

@@ -25,14 +25,14 @@ from surfkit.core.codec import dump, read_json, write_json
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
 
-BATCH, MOST_BATCHES = 40, 200
+MIN_BATCH_PAIRS, MAX_PROGRESS_BATCHES = 40, 200
 """Pairs that are compared at least between two reports of progress; such reports at most, as at each of them pycolmap
 begins by reading what the database says of all photographs."""
 DEFAULT_FOCAL = 1.2
 """Focal length over the longer side, where EXIF says none."""
-KEPT = 64
+CACHED_FEATURES = 64
 """Photographs whose features are kept in memory: those of the pairs of a batch mostly."""
-EXTRA = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4}
+DISTORTION_COEFFICIENTS = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4}
 """Coefficients of distortion; the last three models have two focal lengths."""
 
 
@@ -98,7 +98,7 @@ def match(
     todo = _not_compared(database, named)
     file, done = database.with_name("pairs.txt"), len(pairs) - len(todo)
     given = _given(photos, features, database, file, settings, device)
-    size = max(BATCH, -(-len(pairs) // MOST_BATCHES))
+    size = max(MIN_BATCH_PAIRS, -(-len(pairs) // MAX_PROGRESS_BATCHES))
     for start in range(0, len(todo), size):
         batch = todo[start : start + size]
         with replacing(file) as opened:
@@ -148,7 +148,7 @@ def _given(
     by_name = {photo.name: photo for photo in photos}
     sizes = {photo.name: reduced(photo.size, settings.longest) for photo in photos}
 
-    @lru_cache(KEPT)
+    @lru_cache(CACHED_FEATURES)
     def load(name: str) -> Features:
         found = read_features(feature_file(features, by_name[name], settings))
         return replace(found, keypoints=scaled(found.keypoints, by_name[name].size, sizes[name]))
@@ -255,7 +255,7 @@ def _camera(engine: Any, photo: Photo, model: str) -> Any:
     width, height = photo.size
     focal = photo.exif.focal_px or DEFAULT_FOCAL * max(width, height)
     focals = [focal] if model.endswith("RADIAL") else [focal, focal]
-    params = [*focals, width / 2, height / 2, *[0.0] * EXTRA[model]]
+    params = [*focals, width / 2, height / 2, *[0.0] * DISTORTION_COEFFICIENTS[model]]
     camera = engine.Camera(model=model, width=width, height=height, params=params)
     camera.has_prior_focal_length = photo.exif.focal_px is not None
     return camera

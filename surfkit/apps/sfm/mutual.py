@@ -12,7 +12,7 @@ from torch import Tensor
 from surfkit.apps.sfm.base import FeatureMatcher, MatchInput
 from surfkit.core.check import require_within
 
-AT_ONCE = 4096
+BATCH_DESCRIPTORS = 4096
 """Descriptors that are compared with all of another photograph at once: their similarities are held in memory."""
 
 
@@ -59,7 +59,7 @@ def mutual(one: Tensor, two: Tensor, ratio: float) -> Tensor:
 def _nearest(one: Tensor, two: Tensor, ratio: float) -> Tensor:
     """(N,) position of the nearest of `two`; -1 where another one is nearly as near."""
     found = []
-    for part in one.split(AT_ONCE):
+    for part in one.split(BATCH_DESCRIPTORS):
         likeness, at = (part @ two.T).topk(2, dim=1)
         nearest, next_one = (2 - 2 * likeness).clamp_min(0).sqrt().unbind(1)
         found.append(torch.where(nearest <= ratio * next_one, at[:, 0], -1))

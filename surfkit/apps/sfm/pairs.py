@@ -17,26 +17,26 @@ from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.settings import Settings
 from surfkit.scene.earth import geocentric
 
-SMALL = 60
+MAX_EXHAUSTIVE_PHOTOS = 60
 """Up to so many photographs are all compared with one another."""
-WITH_GPS = 0.8
+MIN_GPS_SHARE = 0.8
 """Share of photographs with a position from which `auto` relies on GPS."""
-STEPS = 3
+SEQUENCE_NEIGHBOURS = 3
 """Neighbours before and after by time or name that are compared too, where positions may be wrong or lacking."""
-WORDS, SAMPLE, PER_PHOTO = 64, 20_000, 300
+VOCABULARY_SIZE, VOCABULARY_DESCRIPTORS, DESCRIPTORS_PER_PHOTO = 64, 20_000, 300
 """Clusters of descriptors; descriptors that they are made from; and that are taken of a photograph."""
 
-NEAREST = 8
+DISTANCE_NEIGHBOURS = 8
 """Neighbours that tell how far away what photographs show is."""
-NEAR_WEIGHT = 0.5
+CAMERA_DISTANCE_WEIGHT = 0.5
 """Of a distance between two cameras, against one between the places that they look at."""
-SPREAD = 1.5
+NEIGHBOUR_SPREAD_FACTOR = 1.5
 """Times as many neighbours, over which the farther half of those that are compared is spread."""
-OVERLAP = 4.0
+LOOK_AHEAD_FACTOR = 4.0
 """Times the distance to the last of the nearest: how far ahead parallel views are taken to look at least."""
-ALIKE, APART = 45.0, 75.0
+MAX_SIMILAR_VIEW_DEGREES, MAX_PAIR_DEGREES = 45.0, 75.0
 """Degrees between viewing directions: up to which two photographs may tell that; from which they are not compared."""
-AT_ONCE = 4096
+BATCH_PHOTOS = 4096
 """Photographs whose candidates are looked at together."""
 
 Pair = tuple[int, int]
@@ -61,13 +61,19 @@ def choose_pairs(
         return sorted(facing(poses, settings.neighbours))
     with_gps = sum(photo.exif.position is not None for photo in photos)
     if way == "auto":
-        way = "exhaustive" if count <= SMALL else "gps" if with_gps >= WITH_GPS * count else "retrieval"
+        way = (
+            "exhaustive"
+            if count <= MAX_EXHAUSTIVE_PHOTOS
+            else "gps"
+            if with_gps >= MIN_GPS_SHARE * count
+            else "retrieval"
+        )
     if way == "exhaustive":
         return [(first, second) for second in range(count) for first in range(second)]
     order = in_order(photos)
     if way == "sequence":
         return sorted(sequence(order, max(1, settings.neighbours // 2)))
-    chosen = sequence(order, STEPS)
+    chosen = sequence(order, SEQUENCE_NEIGHBOURS)
     if way == "gps":
         chosen |= near(photos, settings.neighbours)
     lost = range(count) if way == "retrieval" else [at for at in order if photos[at].exif.position is None]
@@ -125,13 +131,13 @@ def facing(poses: np.ndarray, count: int) -> set[Pair]:
     """
     turns = poses[:, :3, :3]
     centres, views = -(turns.transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], turns[:, 2]
-    places = np.hstack([NEAR_WEIGHT * centres, centres + distance_seen(centres, views) * views])
-    tree, most = cKDTree(places), min(round(SPREAD * count) + 1, len(poses))
+    places = np.hstack([CAMERA_DISTANCE_WEIGHT * centres, centres + distance_seen(centres, views) * views])
+    tree, most = cKDTree(places), min(round(NEIGHBOUR_SPREAD_FACTOR * count) + 1, len(poses))
     near, pairs = (count + 1) // 2, set()
-    for start in range(0, len(poses), AT_ONCE):
-        _, found = tree.query(places[start : start + AT_ONCE], range(1, most + 1))
+    for start in range(0, len(poses), BATCH_PHOTOS):
+        _, found = tree.query(places[start : start + BATCH_PHOTOS], range(1, most + 1))
         for at, row in enumerate(found, start):
-            row = row[(row != at) & (views[row] @ views[at] > np.cos(np.radians(APART)))]
+            row = row[(row != at) & (views[row] @ views[at] > np.cos(np.radians(MAX_PAIR_DEGREES)))]
             rest = row[near:]
             spread = np.linspace(0, len(rest) - 1, min(count - near, len(rest))).round().astype(int)
             pairs |= {(min(at, other), max(at, other)) for other in [*row[:near].tolist(), *rest[spread].tolist()]}
@@ -146,11 +152,11 @@ def distance_seen(centres: np.ndarray, views: np.ndarray) -> float:
         centres: (N, 3) float64.
         views: (N, 3) float64 unit vectors along the optical axes.
     """
-    away, found = cKDTree(centres).query(centres, range(1, min(NEAREST + 1, len(centres)) + 1))
+    away, found = cKDTree(centres).query(centres, range(1, min(DISTANCE_NEIGHBOURS + 1, len(centres)) + 1))
     one, other = np.repeat(np.arange(len(centres)), found.shape[1]), found.ravel()
-    used = (views[one] * views[other]).sum(1) > np.cos(np.radians(ALIKE))
+    used = (views[one] * views[other]).sum(1) > np.cos(np.radians(MAX_SIMILAR_VIEW_DEGREES))
     moved, turned = (values[other[used]] - values[one[used]] for values in (centres, views))
-    least, weight = OVERLAP * float(np.median(away[:, -1])), float((turned**2).sum())
+    least, weight = LOOK_AHEAD_FACTOR * float(np.median(away[:, -1])), float((turned**2).sum())
     return max(least, -float((moved * turned).sum()) / weight if weight > 1e-12 * len(centres) else 0.0)
 
 
@@ -161,9 +167,9 @@ def alike(
     if count < 2:
         return set()
     rng = np.random.default_rng(seed)
-    taken = rng.permutation(count)[: max(1, SAMPLE // PER_PHOTO)]
-    sample = np.concatenate([_some(descriptors(int(at)), PER_PHOTO, rng) for at in taken])
-    words, _ = kmeans2(sample, min(WORDS, len(sample)), minit="++", seed=rng)
+    taken = rng.permutation(count)[: max(1, VOCABULARY_DESCRIPTORS // DESCRIPTORS_PER_PHOTO)]
+    sample = np.concatenate([_some(descriptors(int(at)), DESCRIPTORS_PER_PHOTO, rng) for at in taken])
+    words, _ = kmeans2(sample, min(VOCABULARY_SIZE, len(sample)), minit="++", seed=rng)
     vectors = np.stack([vlad(descriptors(at).astype(np.float32), words) for at in range(count)])
     pairs = set()
     for at in wanted:

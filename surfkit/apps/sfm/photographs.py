@@ -18,25 +18,25 @@ from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.io.datasets.pixels import decide
-from surfkit.scene.names import HEIF, PICTURES
+from surfkit.scene.names import HEIF_SUFFIXES, PICTURE_SUFFIXES
 from surfkit.scene.photos import open_header, photo_size, read_draft, require_heif
-from surfkit.scene.pixels import PLAIN, Alpha, Pixels
+from surfkit.scene.pixels import DEFAULT_PIXELS, Alpha, Pixels
 
-PHOTOGRAPHS = "photographs.json"
+PHOTOGRAPHS_FILE = "photographs.json"
 """File of what was found."""
-OTHER = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
+RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
 """Photographs that Pillow does not decode."""
-HIDDEN = (".", "@eaDir")
+HIDDEN_PREFIXES = (".", "@eaDir")
 """What names begin with that programs, and Synology's disks, keep for themselves."""
 DRAFT_PX = 512
 """At this size light and sharpness are measured."""
-MOST_THREADS = 8
+MAX_READER_THREADS = 8
 """Photographs that are read at once."""
-EDITION = 2
+PHOTOGRAPHS_VERSION = 2
 """Changes when more is found in a photograph: it is looked at again then."""
-PANORAMA = "a panorama"
+PANORAMA_PROBLEM = "a panorama"
 """Begins the problem of one."""
-DARK, FLAT = 8.0, 3.0
+MIN_MEAN_GREY, MIN_GREY_DEVIATION = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
 
 
@@ -57,7 +57,7 @@ class Photo:
         problem: Why it cannot be used; None if it can.
         mask: Digest of its mask; empty without one.
         reading: What the values of the file mean.
-        edition: `EDITION` of the code that looked at it.
+        edition: `PHOTOGRAPHS_VERSION` of the code that looked at it.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Photo:
     sharpness: float = 0.0
     problem: str | None = None
     mask: str = ""
-    reading: Pixels = PLAIN
+    reading: Pixels = DEFAULT_PIXELS
     edition: int = 0
 
     @property
@@ -107,19 +107,19 @@ def look(
     if not folder.is_dir():
         raise BadInput(f"{folder}: {'a file' if folder.exists() else 'no such folder'}; name a folder of photographs")
     files = files_of(folder, without)
-    paths = [path for path in files if path.suffix.lower() in PICTURES]
-    if other := [path.name for path in files if path.suffix.lower() in OTHER]:
+    paths = [path for path in files if path.suffix.lower() in PICTURE_SUFFIXES]
+    if other := [path.name for path in files if path.suffix.lower() in RAW_SUFFIXES]:
         emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
-    if heic := [path for path in paths if path.suffix.lower() in HEIF]:
+    if heic := [path for path in paths if path.suffix.lower() in HEIF_SUFFIXES]:
         try:
             require_heif(f"{folder}: reading {len(heic)} HEIC photographs")
         except BadInput as error:
             if len(heic) == len(paths) and not others:
                 raise
             emit(Warned(f"{error}; they are left out"))
-            paths = [path for path in paths if path.suffix.lower() not in HEIF]
+            paths = [path for path in paths if path.suffix.lower() not in HEIF_SUFFIXES]
     if not paths and not others:
-        raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
+        raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURE_SUFFIXES))}) in it or in folders inside")
     return look_at(folder, paths, known, alpha, ("--alpha",))
 
 
@@ -137,11 +137,11 @@ def look_at(
     for line in decided.lines:
         emit(Warned(line))
     found = []
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_READER_THREADS)) as pool:
         for photo in pool.map(lambda path: _look_unless_known(folder, path, before, decided.pixels), paths):
             found.append(photo)
             emit(Progress("looking at photographs", len(found), len(paths)))
-    if whole := [photo.name for photo in found if (photo.problem or "").startswith(PANORAMA)]:
+    if whole := [photo.name for photo in found if (photo.problem or "").startswith(PANORAMA_PROBLEM)]:
         emit(
             Warned(
                 f"{folder}: {len(whole)} of {len(found)} photographs are panoramas by their XMP, {few(whole)}: no "
@@ -194,9 +194,9 @@ def files_of(folder: Path, without: Path | None = None) -> list[Path]:
                 folders.clear()
                 continue
             seen.add(place)
-            folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN))
+            folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN_PREFIXES))
             starts += [path for name in folders if (path := Path(here, name)).is_symlink()]
-            found += [Path(here, name) for name in names if not name.startswith(HIDDEN)]
+            found += [Path(here, name) for name in names if not name.startswith(HIDDEN_PREFIXES)]
     return sorted(path for path in found if path.is_file() or path.is_symlink())
 
 
@@ -210,8 +210,12 @@ def _look_unless_known(folder: Path, path: Path, known: Mapping[str, Photo], rea
     if not _is_text(name):
         return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
-    wanted = Photo(name, stamp, reading=readings[name], edition=EDITION)
-    if before is not None and (before.stamp, before.reading, before.edition) == (stamp, wanted.reading, EDITION):
+    wanted = Photo(name, stamp, reading=readings[name], edition=PHOTOGRAPHS_VERSION)
+    if before is not None and (before.stamp, before.reading, before.edition) == (
+        stamp,
+        wanted.reading,
+        PHOTOGRAPHS_VERSION,
+    ):
         copy = (before.problem or "").startswith("a copy of")
         return replace(before, problem=None) if copy else before
     try:
@@ -235,10 +239,10 @@ def _look(path: Path, photo: Photo) -> Photo:
     grey = draft.astype(np.float32).mean(2)
     light, contrast = float(grey.mean()), float(grey.std())
     problem = None
-    if contrast < FLAT:
-        problem = "black" if light < DARK else "of one colour"
+    if contrast < MIN_GREY_DEVIATION:
+        problem = "black" if light < MIN_MEAN_GREY else "of one colour"
     if kind is not None:
-        problem = f"{PANORAMA} ({kind})"
+        problem = f"{PANORAMA_PROBLEM} ({kind})"
     return replace(
         photo,
         digest=hashlib.sha256(path.read_bytes() + _said(photo.reading)).hexdigest()[:32],
@@ -247,14 +251,14 @@ def _look(path: Path, photo: Photo) -> Photo:
         pixels=hashlib.sha256(draft.tobytes()).hexdigest()[:32],
         light=light,
         contrast=contrast,
-        sharpness=_sharpness(grey) / max(contrast, FLAT),
+        sharpness=_sharpness(grey) / max(contrast, MIN_GREY_DEVIATION),
         problem=problem,
     )
 
 
 def _said(reading: Pixels) -> bytes:
     """What tells readings of one file apart; nothing of the usual one."""
-    return b"" if reading == PLAIN else repr(reading).encode()
+    return b"" if reading == DEFAULT_PIXELS else repr(reading).encode()
 
 
 def _sharpness(grey: np.ndarray) -> float:

@@ -11,20 +11,20 @@ from surfkit.apps.sfm.level import points_of, poses_of
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.io.datasets.georeference import Similarity
 
-FAR_M, HIGH_M = 1000.0, 300.0
+MAX_POSITION_ERROR_M, MAX_ALTITUDE_ERROR_M = 1000.0, 300.0
 """Receivers in cameras are not so wrong, across and in altitude, whatever they count it from."""
-LOW_M = -100.0
+MIN_LAND_M = -100.0
 """Little land is lower."""
-UPRIGHT = 0.5
+MIN_UPRIGHT_COSINE = 0.5
 """Cosine between up on the map and up by how cameras are held; between this and its negative neither is sure."""
-LOOKS_UP = 0.3
+MIN_UPWARD_SINE = 0.3
 """Sine of the mean direction of view above the horizon, beyond which cameras look up."""
-FAR_BETTER = 3.0
+MIN_FIT_RATIO = 3.0
 """A fit that is so many times better than a mirrored one is no chance, nor the other way round."""
 
 
 @dataclass(frozen=True)
-class Hand:
+class Handedness:
     """Whether places are told from their mirror image: how well a similarity fits, and how well a mirrored one.
 
     Attributes:
@@ -38,7 +38,7 @@ class Hand:
     least: float
 
     @classmethod
-    def of(cls, xyz: np.ndarray, onto: np.ndarray, least: float) -> Hand:
+    def of(cls, xyz: np.ndarray, onto: np.ndarray, least: float) -> Handedness:
         """That of (P, 3) positions and the (P, 3) places where they belong; `least` is in the unit of these."""
         even = np.ones(len(xyz))
         plain, mirrored = (
@@ -50,12 +50,12 @@ class Hand:
     @property
     def right(self) -> bool:
         """Whether the mirrored one is far worse."""
-        return self.mirrored > max(FAR_BETTER * self.plain, self.least)
+        return self.mirrored > max(MIN_FIT_RATIO * self.plain, self.least)
 
     @property
     def wrong(self) -> bool:
         """Whether the mirrored one is far better."""
-        return self.plain > max(FAR_BETTER * self.mirrored, self.least)
+        return self.plain > max(MIN_FIT_RATIO * self.mirrored, self.least)
 
 
 def upside_down(model: Any, similarity: Similarity, up: np.ndarray, metres: float, handed: bool) -> str | None:
@@ -74,8 +74,8 @@ def upside_down(model: Any, similarity: Similarity, up: np.ndarray, metres: floa
     points = similarity.points(points_of(model))
     above = float(np.median(centres[:, 2]) - np.median(points[:, 2])) * metres
     upright = float((similarity.turn @ up)[2])
-    turned = upright < -UPRIGHT and not (handed and view < LOOKS_UP)
-    if not turned and not (upright < UPRIGHT and view > LOOKS_UP and above < 0):
+    turned = upright < -MIN_UPRIGHT_COSINE and not (handed and view < MIN_UPWARD_SINE)
+    if not turned and not (upright < MIN_UPRIGHT_COSINE and view > MIN_UPWARD_SINE and above < 0):
         return None
     degrees = np.degrees(np.arcsin(np.clip(view, -1, 1)))
     where = f"{abs(above):.0f} m {'below' if above < 0 else 'above'} the ground"

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from surfkit.apps.sfm.exif import MOST_ERROR_M, Position
+from surfkit.apps.sfm.exif import MAX_ERROR_M, Position
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.systems import WGS84_DEGREES, System, names_a_system, system_of
 
-COLUMNS = {
+COLUMN_NAMES = {
     "name": "name label image imagename imagefile photo photograph photoname file filename sourcefile camera "
     "cameraname picture",
     "x": "x xlongitude xeast xeasting easting east e longitude lon long lng gpslongitude geox",
@@ -30,21 +30,21 @@ COLUMNS = {
     "accuracyvertical vacc gpszaccuracy sdheight stdheight",
 }
 """Names of the columns that are used, in small letters without blanks, units and marks."""
-MEANINGS = {name: column for column, names in COLUMNS.items() for name in names.split()}
-PLAIN = ("name", "x", "y", "z", "yaw", "pitch", "roll", "sxy", "sz")
+MEANINGS = {name: column for column, names in COLUMN_NAMES.items() for name in names.split()}
+GEO_TXT_COLUMNS = ("name", "x", "y", "z", "yaw", "pitch", "roll", "sxy", "sz")
 """Columns of geo.txt, and of a table without a header."""
-DEGREES = {"longitude", "lon", "long", "lng", "gpslongitude"}
+DEGREE_NAMES = {"longitude", "lon", "long", "lng", "gpslongitude"}
 """Names of x that say degrees."""
 COMMENT = re.compile(r"#\s*(?:CoordinateSystem\s*:\s*)?(.*)", re.IGNORECASE)
 """A line that Metashape or a person begins with #; it may name the system, or the columns."""
-MARKS = "\t;,"
+CELL_SEPARATORS = "\t;,"
 """What may stand between cells; blanks otherwise."""
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 WANTED = "name, x (east or longitude), y (north or latitude) and z, such as `DJI_0001.JPG,372345.1,5846123.4,120.5`"
 
 
 @dataclass(frozen=True)
-class Row:
+class PositionRow:
     """A line of the file.
 
     Attributes:
@@ -105,7 +105,7 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
     given = crs if crs is not None else named
     if given is None and degrees:
         given = WGS84_DEGREES
-    found: dict[str, tuple[Row, System, list[float | None]]] = {}
+    found: dict[str, tuple[PositionRow, System, list[float | None]]] = {}
     systems: dict[str, System] = {}
     for row in rows:
         text = row.cells.get("crs") or given
@@ -136,7 +136,7 @@ def _system(text: str, where: str) -> System:
         raise BadInput(f"{where}: {error}") from error
 
 
-def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]:
+def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[PositionRow], bool]:
     """The system that a line before the positions names, the rows, and whether names of columns say degrees."""
     system, header, rows, degrees = None, None, [], False
     for at, line in enumerate(lines, 1):
@@ -149,16 +149,20 @@ def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]
             system = plain
             continue
         if not rows and header is None and (columns := _header(plain)) is not None:
-            header, degrees = columns, any(_small(cell) in DEGREES for cell in _split(plain))
+            header, degrees = columns, any(_small(cell) in DEGREE_NAMES for cell in _split(plain))
             continue
         if comment:
             continue
         cells = _split(text) if header is not None else _joined(_split(text))
         first = not rows and system is None and header is None
-        if first and not any(mark in text for mark in MARKS) and not (len(cells) > 2 and _is_number(cells[1])):
+        if (
+            first
+            and not any(mark in text for mark in CELL_SEPARATORS)
+            and not (len(cells) > 2 and _is_number(cells[1]))
+        ):
             system = text  # by a name that pyproj may know
             continue
-        row = Row(at, dict(zip(header or _plain(cells), (cell.strip() for cell in cells), strict=False)))
+        row = PositionRow(at, dict(zip(header or _plain(cells), (cell.strip() for cell in cells), strict=False)))
         if header is not None and not (row.cells.get("x") or row.cells.get("y")):
             continue  # a photograph without a position, as Metashape lists them
         if not row.cells.get("name"):
@@ -170,7 +174,7 @@ def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]
 def _plain(cells: Sequence[str]) -> list[str]:
     """The meaning of each cell of a line without names of columns; the last may be a system."""
     named = len(cells) > 3 and names_a_system(cells[-1])
-    return [*PLAIN[: len(cells) - named], *["crs"] * named]
+    return [*GEO_TXT_COLUMNS[: len(cells) - named], *["crs"] * named]
 
 
 def _header(text: str) -> list[str] | None:
@@ -189,7 +193,7 @@ def _small(cell: str) -> str:
 
 def _split(text: str) -> list[str]:
     """The cells of a line."""
-    mark = next((mark for mark in MARKS if text.count(mark) >= 2), None)
+    mark = next((mark for mark in CELL_SEPARATORS if text.count(mark) >= 2), None)
     if mark is None:
         return text.split()
     cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
@@ -214,7 +218,7 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _number(text: str | None, said: str, row: Row, optional: bool = False) -> float | None:
+def _number(text: str | None, said: str, row: PositionRow, optional: bool = False) -> float | None:
     """A finite number; None for one that may be missing, and is."""
     if optional and (text or "").lower() in ("", "-", "nan", "none", "null"):
         return None
@@ -228,7 +232,7 @@ def _number(text: str | None, said: str, row: Row, optional: bool = False) -> fl
     return found
 
 
-def _positions(found: Mapping[str, tuple[Row, System, list[float | None]]], said: str) -> dict[str, Position]:
+def _positions(found: Mapping[str, tuple[PositionRow, System, list[float | None]]], said: str) -> dict[str, Position]:
     """Latitudes, longitudes and altitudes, all of a system at once."""
     positions: dict[str, Position] = {}
     for system in {system for _, system, _ in found.values()}:
@@ -251,9 +255,9 @@ def _positions(found: Mapping[str, tuple[Row, System, list[float | None]]], said
     return positions
 
 
-def _accuracy(row: Row, said: str) -> tuple[float, float, float] | None:
+def _accuracy(row: PositionRow, said: str) -> tuple[float, float, float] | None:
     """Standard deviations, if the row gives them across and up."""
     across = row.cells.get("sxy")
     texts = [row.cells.get("sx") or across, row.cells.get("sy") or across, row.cells.get("sz")]
     found = tuple(_number(text, said, row) or 0.0 for text in texts if text and _is_number(text))
-    return found if len(found) == 3 and all(0 < value < MOST_ERROR_M for value in found) else None
+    return found if len(found) == 3 and all(0 < value < MAX_ERROR_M for value in found) else None

@@ -15,16 +15,16 @@ import numpy as np
 
 from surfkit.apps.sfm.exif import Exif, Position
 from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import FAR_M, LOW_M
+from surfkit.apps.sfm.plausible import MAX_POSITION_ERROR_M, MIN_LAND_M
 from surfkit.apps.sfm.position_list import Listed, read_list
 from surfkit.apps.sfm.settings import Settings
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.scene.earth import geocentric
 
-GEO = "geo.txt"
+GEO_FILE = "geo.txt"
 """List of OpenDroneMap, beside the photographs or in the folder above."""
-AXES = ("latitude", "longitude")
+GEODETIC_AXES = ("latitude", "longitude")
 LETTERS = {"latitude": "N or S", "longitude": "E or W"}
 NEAR_DEGREES = 1.0
 """Photographs of one survey are nearer to one another."""
@@ -49,7 +49,7 @@ class Positions:
     @property
     def open(self) -> tuple[str, ...]:
         """Of latitude and longitude, those whose sign is not known in some photograph."""
-        return tuple(axis for axis in AXES if any(axis in photo.exif.unsigned for photo in self.photos))
+        return tuple(axis for axis in GEODETIC_AXES if any(axis in photo.exif.unsigned for photo in self.photos))
 
     def readings(self) -> list[list[Photo]]:
         """The photographs with each choice of the signs that are not known; one list where all are."""
@@ -86,7 +86,7 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
         if not found.positions:
             raise BadInput(f"{said}: it names none of the {len(photos)} photographs, such as {photos[0].name!r}")
     else:
-        path = next((path for path in (root / GEO, root.absolute().parent / GEO) if path.is_file()), None)
+        path = next((path for path in (root / GEO_FILE, root.absolute().parent / GEO_FILE) if path.is_file()), None)
         if path is None:
             return list(photos), None
         said = str(path)
@@ -94,7 +94,7 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
             found = _named(read_list(path, said), photos, said)
         except BadInput as error:
             raise BadInput(
-                f"{error}; {GEO} is read as OpenDroneMap's list of positions: mend it, or rename it"
+                f"{error}; {GEO_FILE} is read as OpenDroneMap's list of positions: mend it, or rename it"
             ) from error
         if not found.positions:
             emit(Warned(f"{said} names none of the photographs and is not used"))
@@ -111,7 +111,7 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
         for before, after in zip(photos, listed, strict=True)
         if before.exif.position is not None and not before.exif.unsigned and after is not before
     ]
-    if away and np.median(away) > FAR_M:
+    if away and np.median(away) > MAX_POSITION_ERROR_M:
         emit(
             Warned(
                 f"{said} puts the photographs {np.median(away) / 1000:.0f} km from their positions in EXIF: is its "
@@ -243,7 +243,7 @@ def _heights(photos: Sequence[Photo]) -> list[Photo]:
     if low := [name for name, height in heights.items() if height < LOWEST_M]:
         emit(Warned(f"{len(low)} positions are below any land, and are taken as above their zero: {few(low)}"))
         heights |= {name: -heights[name] for name in low}
-    if heights and (middle := float(np.median(list(heights.values())))) < LOW_M:
+    if heights and (middle := float(np.median(list(heights.values())))) < MIN_LAND_M:
         emit(Warned(f"the positions are {-middle:.0f} m below their zero, where little land is: do they count down?"))
     if unsure := [photo.name for photo in given if photo.exif.no_reference and photo.name in heights]:
         emit(
@@ -270,7 +270,7 @@ def _heights(photos: Sequence[Photo]) -> list[Photo]:
 def no_letters(photos: Sequence[Photo]) -> str:
     """That letters of the hemisphere are missing, in how many photographs and which."""
     lacking = [photo for photo in photos if photo.exif.unsigned]
-    which = [LETTERS[axis] for axis in AXES if any(axis in photo.exif.unsigned for photo in lacking)]
+    which = [LETTERS[axis] for axis in GEODETIC_AXES if any(axis in photo.exif.unsigned for photo in lacking)]
     return f"EXIF of {len(lacking)} photographs has no letter of the hemisphere ({', '.join(which)})"
 
 
@@ -279,7 +279,7 @@ def _signed(photo: Photo, signs: Mapping[str, int]) -> Photo:
         return photo
     at = list(photo.exif.position)
     for axis in photo.exif.unsigned:
-        at[AXES.index(axis)] *= signs[axis]
+        at[GEODETIC_AXES.index(axis)] *= signs[axis]
     return replace(photo, exif=replace(photo.exif, position=tuple(at), unsigned=()))
 
 
@@ -287,7 +287,9 @@ def _like(position: Position, other: Position, axes: Sequence[str]) -> Position:
     """A position with the signs of another, along some axes."""
     at = list(position)
     for axis in axes:
-        at[AXES.index(axis)] = float(np.copysign(position[AXES.index(axis)], other[AXES.index(axis)]))
+        at[GEODETIC_AXES.index(axis)] = float(
+            np.copysign(position[GEODETIC_AXES.index(axis)], other[GEODETIC_AXES.index(axis)])
+        )
     return at[0], at[1], at[2]
 
 

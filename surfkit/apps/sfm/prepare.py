@@ -17,33 +17,33 @@ from surfkit.apps.sfm.deliver import deliver
 from surfkit.apps.sfm.deliver_masks import deliver_masks
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
-from surfkit.apps.sfm.georeference import Placement, Refused, centres_of
-from surfkit.apps.sfm.ground_control import Control, Ground, doubts, place_by_points, read_ground
+from surfkit.apps.sfm.georeference import NoSimilarity, Placement, centres_of
+from surfkit.apps.sfm.ground_control import ControlResiduals, GroundControl, doubts, place_by_points, read_ground
 from surfkit.apps.sfm.level import points_of, turn_upright, up_of
-from surfkit.apps.sfm.mapping import SMALLEST, map_photographs, read_model
+from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, map_photographs, read_model
 from surfkit.apps.sfm.matching import matched
-from surfkit.apps.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs
+from surfkit.apps.sfm.photographs import PHOTOGRAPHS_FILE, Photo, known_photographs
 from surfkit.apps.sfm.plausible import upside_down
 from surfkit.apps.sfm.positions import Positions, settle
 from surfkit.apps.sfm.report import draw, model_facts, reasons
-from surfkit.apps.sfm.settings import REPORT, WORK, Settings
-from surfkit.apps.sfm.site import Reading, decide, heights_named, locate, readings
+from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
+from surfkit.apps.sfm.site import PositionHypothesis, decide, heights_named, locate, readings
 from surfkit.apps.sfm.sources import Sources, look_at_all
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.stages import Stages, key_of
+from surfkit.core.stages import StageFolder, key_of
 from surfkit.io.datasets.georeference import Similarity
-from surfkit.io.datasets.placed import Placed
+from surfkit.io.datasets.placed import Georeference
 from surfkit.scene.crs import EGM96
 
-PICTURE = "cameras.png"
-SOURCE = "source.txt"
+CAMERAS_PICTURE = "cameras.png"
+SOURCE_FILE = "source.txt"
 """In the work folder: the folder that the photographs are from. They may change there, as when all are saved anew."""
 
 
 @dataclass(frozen=True)
-class Preparation:
+class SfmPreparation:
     """A folder of photographs on its way to a data set.
 
     Attributes:
@@ -63,7 +63,7 @@ class Preparation:
     @property
     def work(self) -> Path:
         """Folder of what the stages keep."""
-        return self.scene / WORK
+        return self.scene / WORK_FOLDER
 
     def run(self) -> dict[str, Any]:
         """Go through all stages that are not complete; the report.
@@ -73,7 +73,7 @@ class Preparation:
         """
         load_engine()
         self.settings.refuse_missing()
-        stages = Stages(self.work)
+        stages = StageFolder(self.work)
         sources, photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
@@ -94,10 +94,10 @@ class Preparation:
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
     def _look(self) -> tuple[Sources, list[Photo]]:
-        path = self.work / PHOTOGRAPHS
+        path = self.work / PHOTOGRAPHS_FILE
         before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
-        root, source = os.fsencode(self.root.resolve()), self.work / SOURCE  # bytes: names need not be UTF-8
+        root, source = os.fsencode(self.root.resolve()), self.work / SOURCE_FILE  # bytes: names need not be UTF-8
         if not (source.is_file() and source.read_bytes() == root):
             _refuse_others(self.scene, self.root, before, photos)
         elif before and not any(photo.shows_what(other) for photo, other in _alike(before, photos)):
@@ -111,23 +111,27 @@ class Preparation:
         source.write_bytes(root)
         return sources, photos
 
-    def _deliver(self, models: Sequence[tuple[Any, Placed | None]], photos: dict[str, Photo], sources: Sources) -> None:
+    def _deliver(
+        self, models: Sequence[tuple[Any, Georeference | None]], photos: dict[str, Photo], sources: Sources
+    ) -> None:
         """Write photographs, masks and models of the data set."""
         deliver_masks([model for model, _ in models], photos, sources, self.scene, self.work)
         deliver(models, photos, sources, self.scene, self.work)
 
     def _refuse_few(self, photos: Sequence[Photo], usable: Sequence[Photo]) -> None:
-        if len(usable) >= SMALLEST:
+        if len(usable) >= MIN_MODEL_PHOTOS:
             return
         wrong = [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]
         why = f"; not usable: {few(wrong)}" if wrong else ""
         raise BadInput(
             f"{self.root}: {len(usable)} of {len(photos)} photographs can be used{why}; cameras are found for "
-            f"{SMALLEST} or more that show the same place from several sides"
+            f"{MIN_MODEL_PHOTOS} or more that show the same place from several sides"
         )
 
     def _map(self, database: Path, count: int) -> list[Path]:
-        return map_photographs(database, self.work / "models", count, self.settings) if count >= SMALLEST else []
+        return (
+            map_photographs(database, self.work / "models", count, self.settings) if count >= MIN_MODEL_PHOTOS else []
+        )
 
     def _load_models(self) -> list[Path]:
         folder = self.work / "models"
@@ -146,7 +150,7 @@ class Preparation:
             "views of each place, from positions that differ"
         )
 
-    def _site(self, positions: Positions) -> Ground | list[Reading]:
+    def _site(self, positions: Positions) -> GroundControl | list[PositionHypothesis]:
         """Ground control points on their map; else what the positions may mean, nothing where there are none."""
         if self.settings.gcp is not None:
             sizes = {photo.name: photo.size for photo in positions.photos}
@@ -154,19 +158,19 @@ class Preparation:
         return readings(positions, self.settings.crs) if self.settings.gps else []
 
     def _place(
-        self, models: Sequence[Path], positions: Positions, site: Ground | list[Reading]
-    ) -> list[tuple[Any, Placement | Control | None, Weighed]]:
+        self, models: Sequence[Path], positions: Positions, site: GroundControl | list[PositionHypothesis]
+    ) -> list[tuple[Any, Placement | ControlResiduals | None, Weighed]]:
         """The models, each on the map or level, and what became of their focal lengths and heights."""
         photos = {photo.name: photo for photo in positions.photos}
         alone = [read_model(path) for path in models]
         loaded = [self._with_exif(number, model, photos) for number, model in enumerate(alone)]
-        chosen: Ground | Reading | Refused
-        if isinstance(site, Ground):
+        chosen: GroundControl | PositionHypothesis | NoSimilarity
+        if isinstance(site, GroundControl):
             chosen = site
         elif site:
             chosen = decide(loaded[0], site, positions, self.settings.seed)
         else:
-            chosen = Refused("no photograph has a position in EXIF or XMP" if self.settings.gps else "--no-gps")
+            chosen = NoSimilarity("no photograph has a position in EXIF or XMP" if self.settings.gps else "--no-gps")
         placed = []
         for number, (before, model) in enumerate(zip(alone, loaded, strict=True)):
             final, where, stretch = self._place_one(number, model, chosen, photos)
@@ -176,23 +180,23 @@ class Preparation:
         return placed
 
     def _place_one(
-        self, number: int, model: Any, site: Ground | Reading | Refused, photos: dict[str, Photo]
-    ) -> tuple[Any, Placement | Control | None, tuple[float, float] | None]:
+        self, number: int, model: Any, site: GroundControl | PositionHypothesis | NoSimilarity, photos: dict[str, Photo]
+    ) -> tuple[Any, Placement | ControlResiduals | None, tuple[float, float] | None]:
         """A model on the map or level, and how heights by GPS differ from those of its cameras (`height_stretch`)."""
-        where: Placement | Control | Refused
-        if isinstance(site, Ground):
+        where: Placement | ControlResiduals | NoSimilarity
+        if isinstance(site, GroundControl):
             where = self._by_points(number, model, site, photos)
-        elif isinstance(site, Reading):
+        elif isinstance(site, PositionHypothesis):
             photos = {photo.name: photo for photo in site.photos}
             where = locate(model, site, self.settings.seed)
         else:
             where = site
-        if isinstance(where, Refused):
+        if isinstance(where, NoSimilarity):
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
             return _levelled(model, photos), None, None
         model.transform(_sim3d(where.similarity))
         _name_wrong(where)
-        if isinstance(where, Control):
+        if isinstance(where, ControlResiduals):
             return model, where, None
         if where.plan:
             emit(
@@ -223,22 +227,24 @@ class Preparation:
             emit(Warned(f"sparse/{number}: the focal lengths of EXIF do not fit the photographs and are left out"))
         return found or copy
 
-    def _by_points(self, number: int, model: Any, ground: Ground, photos: dict[str, Photo]) -> Control | Refused:
+    def _by_points(
+        self, number: int, model: Any, ground: GroundControl, photos: dict[str, Photo]
+    ) -> ControlResiduals | NoSimilarity:
         """The model by control points, unless these put it where no survey can be; says what is doubtful."""
         where = place_by_points(model, ground, self.settings.checkpoints)
-        if isinstance(where, Refused):
+        if isinstance(where, NoSimilarity):
             return where
         if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):
-            return Refused(f"by the ground control points {why}; x must be east and y north, and heights count up")
+            return NoSimilarity(f"by the ground control points {why}; x must be east and y north, and heights count up")
         for doubt in doubts(where, centres_of(model), list(photos.values())):
             emit(Warned(f"sparse/{number}: {doubt}"))
         return where
 
     def _report(
         self,
-        stages: Stages,
+        stages: StageFolder,
         photos: Sequence[Photo],
-        placed: Sequence[tuple[Any, Placement | Control | None, Weighed]],
+        placed: Sequence[tuple[Any, Placement | ControlResiduals | None, Weighed]],
         why: dict[str, str],
     ) -> dict[str, Any]:
         report = {
@@ -249,8 +255,8 @@ class Preparation:
             "seconds": stages.seconds(),
             "settings": self.settings,
         }
-        write_json(self.scene / REPORT, report)
-        draw(self.scene / PICTURE, read_drawn(self.scene), placed[0][1])
+        write_json(self.scene / REPORT_FILE, report)
+        draw(self.scene / CAMERAS_PICTURE, read_drawn(self.scene), placed[0][1])
         return report
 
 
@@ -274,9 +280,9 @@ def _alike(before: Sequence[Photo], photos: Sequence[Photo]) -> list[tuple[Photo
     return [(photo, now[photo.name]) for photo in before if photo.name in now]
 
 
-def _name_wrong(where: Placement | Control) -> None:
+def _name_wrong(where: Placement | ControlResiduals) -> None:
     """Say which positions or control points are left out."""
-    if isinstance(where, Control):
+    if isinstance(where, ControlResiduals):
         for names, why in ((where.wrong, "contradict the others"), (where.unseen, "are in too few placed photographs")):
             if names:
                 emit(Warned(f"{len(names)} ground control points {why} and are left out: {few(names)}"))
@@ -300,12 +306,12 @@ def _sim3d(given: Similarity) -> Any:
     return engine.Sim3d(given.scale, engine.Rotation3d(given.turn), given.move)
 
 
-def _placed(where: Placement | Control, given: str) -> Placed:
+def _placed(where: Placement | ControlResiduals, given: str) -> Georeference:
     """For the file beside a model; other programs know `crs` better without a vertical part that nobody has given."""
     crs, heights = where.chart.crs, None
     if given == "auto" and crs.endswith(EGM96):
         crs, heights = crs.removesuffix(EGM96), f"EPSG:{EGM96.removeprefix('+')}"
-    return Placed(crs, where.chart.offset, where.chart.metres, heights)
+    return Georeference(crs, where.chart.offset, where.chart.metres, heights)
 
 
 def _levelled(model: Any, photos: dict[str, Photo]) -> Any:

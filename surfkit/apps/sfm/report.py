@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.sfm.features import FEWEST
+from surfkit.apps.sfm.features import MIN_FEATURES
 from surfkit.apps.sfm.georeference import Placement, centres_of
-from surfkit.apps.sfm.ground_control import Control
-from surfkit.apps.sfm.photographs import DARK, Photo, blurred_below
+from surfkit.apps.sfm.ground_control import ControlResiduals
+from surfkit.apps.sfm.photographs import MIN_MEAN_GREY, Photo, blurred_below
 from surfkit.core.files import replacing
 
-MOST_POINTS = 20_000
+MAX_PICTURE_POINTS = 20_000
 """Points in the picture."""
 
 
@@ -35,14 +35,14 @@ def reasons(
         if models and name in models[0]:
             continue
         sight = " (far less sharp than the others)" if photo.usable and photo.sharpness < blurred else ""
-        sight = " (dark)" if photo.usable and photo.light < DARK else sight
+        sight = " (dark)" if photo.usable and photo.light < MIN_MEAN_GREY else sight
         group = next((number for number, names in enumerate(models) if name in names), None)
         if photo.problem is not None:
             found[name] = photo.problem
         elif group is not None:
             found[name] = f"in another group of photographs, without matches to the largest: sparse/{group}"
-        elif features.get(name, 0) < FEWEST:
-            found[name] = f"{features.get(name, 0)} features, {FEWEST} are needed{sight}"
+        elif features.get(name, 0) < MIN_FEATURES:
+            found[name] = f"{features.get(name, 0)} features, {MIN_FEATURES} are needed{sight}"
         elif not matches.get(name):
             found[name] = f"matches no other photograph{sight}"
         else:
@@ -50,7 +50,7 @@ def reasons(
     return found
 
 
-def model_facts(model: Any, placement: Placement | Control | None) -> dict[str, Any]:
+def model_facts(model: Any, placement: Placement | ControlResiduals | None) -> dict[str, Any]:
     """Figures of a model, and its residuals on the map."""
     facts: dict[str, Any] = {
         "photographs": model.num_reg_images(),
@@ -67,7 +67,7 @@ def model_facts(model: Any, placement: Placement | Control | None) -> dict[str, 
             for _, camera in sorted(model.cameras.items())
         ],
     }
-    if isinstance(placement, Control):
+    if isinstance(placement, ControlResiduals):
         facts["ground_control"] = placement.facts()
     elif placement is not None:
         facts["georeference"] = georeference_facts(model, placement)
@@ -98,13 +98,13 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
     }
 
 
-def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
+def draw(path: Path, model: Any, placement: Placement | ControlResiduals | None) -> None:
     """A picture of cameras and points from above; of positions too, with a line to the camera of each."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
     points = sorted(model.points3D.items())
-    points = points[:: max(1, len(points) // MOST_POINTS)]
+    points = points[:: max(1, len(points) // MAX_PICTURE_POINTS)]
     xyz = np.array([point.xyz for _, point in points]).reshape(-1, 3)
     rgb = np.array([point.color for _, point in points], np.float64).reshape(-1, 3) / 255
     centres = centres_of(model)

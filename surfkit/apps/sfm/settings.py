@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.registry import choice
 from surfkit.scene.pixels import Alpha
 
-WORK, REPORT = "prepare", "report.json"
+WORK_FOLDER, REPORT_FILE = "prepare", "report.json"
 """Folder of the data set for what the stages keep, and what is told of it at the end."""
 
 

@@ -19,7 +19,7 @@ from surfkit.core.registry import name_of
 
 BYTES_PER_PIXEL = 160
 """That SIFT takes with the photograph doubled in size first: five levels of an octave and as many differences."""
-MOST_BYTES = 2 << 30
+MAX_SIFT_BYTES = 2 << 30
 """Of all threads together."""
 
 
@@ -32,7 +32,7 @@ class SIFT(FeatureExtractor):
 
     def at_once(self, pixels: int) -> int:
         """See `FeatureExtractor.at_once`."""
-        threads = min(os.cpu_count() or 1, MOST_BYTES // (BYTES_PER_PIXEL * pixels))
+        threads = min(os.cpu_count() or 1, MAX_SIFT_BYTES // (BYTES_PER_PIXEL * pixels))
         return 1 if load_engine().has_cuda else max(1, threads)
 
     def opened(self, most: int, device: torch.device) -> Find:

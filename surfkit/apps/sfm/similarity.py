@@ -15,28 +15,28 @@ import numpy as np
 
 from surfkit.io.datasets.georeference import Similarity
 
-DRAWS, ROUNDS = 300, 10
+TRIPLE_DRAWS, CONCENTRATION_STEPS = 300, 10
 """Fits to three positions; concentrations of each."""
-MOST_ROUNDS = 60
+MAX_FIT_ROUNDS = 60
 """Of the last fit: the weights of a few accurate positions rise to their own by about a half a round."""
-STEP = 3.0
+SIGMA_GROUP_FACTOR = 3.0
 """Where standard deviations, in their order, rise by this factor from one to the next, another group begins."""
-MOST = 1500
+MAX_CONSENSUS_POSITIONS = 1500
 """Positions among which the consensus is sought: of more, a random part stands for all, as in FAST-LTS."""
-SIGMAS = 4.0
+OUTLIER_SIGMAS = 4.0
 """A position is wrong beyond so many standard deviations of the residuals: of Gaussian ones, 1 of 900 is."""
 MEDIAN_OF_CHI3 = 1.5382
 """Median length of residuals whose three coordinates have a standard deviation of 1."""
 PARAMETERS = 7 / 3
 """Of a similarity, in coordinates of a position."""
-SETTLED = 1e-6
+MAX_SETTLED_MOVE = 1e-6
 """A fit that moves by less, in standard deviations of the most accurate position, moves no more."""
-FEWEST = 4
+MIN_AGREEING_POSITIONS = 4
 """Positions that must agree; any three fit a similarity nearly."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class SimilarityFit:
     """A similarity from one set of positions to another.
 
     Attributes:
@@ -90,8 +90,8 @@ def umeyama(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray) -> Similarit
 
 def fit_robustly(
     xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = None, seed: int = 0, least: float = 0.0
-) -> Fit | None:
-    """The similarity on which most positions agree; None where fewer than `FEWEST` do.
+) -> SimilarityFit | None:
+    """The similarity on which most positions agree; None where fewer than `MIN_AGREEING_POSITIONS` do.
 
     Args:
         xyz: (P, 3) float64.
@@ -101,35 +101,35 @@ def fit_robustly(
         least: A position with a shorter residual is never wrong, in the unit of `onto`.
     """
     count = len(xyz)
-    if count < FEWEST:
+    if count < MIN_AGREEING_POSITIONS:
         return None
     stated = np.ones(count) if sigma is None else np.asarray(sigma, np.float64)
     groups = _groups(stated)
     best = _consensus(xyz, onto, 1 / stated**2, np.random.default_rng(seed))
     inside = np.ones(count, bool)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_FIT_ROUNDS):
         away = np.linalg.norm(onto - best.points(xyz), axis=1)
         spread, limit = _spread(away, stated, groups)
-        now = (away <= SIGMAS * limit) | (away <= least)
-        if now.sum() < FEWEST:
+        now = (away <= OUTLIER_SIGMAS * limit) | (away <= least)
+        if now.sum() < MIN_AGREEING_POSITIONS:
             return None
         before, best = best, umeyama(xyz, onto, now / spread**2)
         moved = np.abs(best.points(xyz) - before.points(xyz)).max()
-        if (now == inside).all() and moved <= SETTLED * spread.min():
+        if (now == inside).all() and moved <= MAX_SETTLED_MOVE * spread.min():
             break
         inside = now
     residuals = onto - best.points(xyz)
     if len(groups) == 1:
         free = inside.sum() / max(inside.sum() - PARAMETERS, 1)
         spread = stated * max(np.sqrt(((residuals[inside] / stated[inside, None]) ** 2).mean() * free), 1e-9)
-    fit = Fit(best, inside, residuals, np.zeros(3), spread)
+    fit = SimilarityFit(best, inside, residuals, np.zeros(3), spread)
     return replace(fit, sigma=fit.deviation(inside))
 
 
 def _groups(stated: np.ndarray) -> list[np.ndarray]:
     """Rows of positions that state about the same accuracy, the most accurate first."""
     order = np.argsort(stated, kind="stable")
-    steps = np.flatnonzero(stated[order][1:] > STEP * stated[order][:-1]) + 1
+    steps = np.flatnonzero(stated[order][1:] > SIGMA_GROUP_FACTOR * stated[order][:-1]) + 1
     return np.split(order, steps)
 
 
@@ -145,7 +145,7 @@ def _spread(away: np.ndarray, stated: np.ndarray, groups: Sequence[np.ndarray]) 
     for rows in (largest, *(rows for rows in groups if rows is not largest)):
         unit = max(float(np.median(away[rows] / stated[rows])) / MEDIAN_OF_CHI3, 1e-9)
         # of few positions a fit comes too near to some (Rousseeuw and Leroy, 1987)
-        small = 1 + 5 / (len(rows) - PARAMETERS) if len(rows) >= FEWEST else 1.0
+        small = 1 + 5 / (len(rows) - PARAMETERS) if len(rows) >= MIN_AGREEING_POSITIONS else 1.0
         if rows is largest:
             spread[rows], limit[rows] = unit * stated[rows], small * unit * stated[rows]
             continue
@@ -157,16 +157,16 @@ def _spread(away: np.ndarray, stated: np.ndarray, groups: Sequence[np.ndarray]) 
 
 def _consensus(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Similarity:
     """The fit with the least sum of squares over its best half."""
-    if len(xyz) > MOST:
-        part = rng.choice(len(xyz), MOST, replace=False)
+    if len(xyz) > MAX_CONSENSUS_POSITIONS:
+        part = rng.choice(len(xyz), MAX_CONSENSUS_POSITIONS, replace=False)
         xyz, onto, weights = xyz[part], onto[part], weights[part]
     count = len(xyz)
-    half = max(FEWEST, (count + 4) // 2)
+    half = max(MIN_AGREEING_POSITIONS, (count + 4) // 2)
     best, least = umeyama(xyz, onto, weights), np.inf
-    for _ in range(DRAWS if count > FEWEST else 1):
+    for _ in range(TRIPLE_DRAWS if count > MIN_AGREEING_POSITIONS else 1):
         chosen = np.zeros(count, bool)
         chosen[rng.choice(count, 3, replace=False)] = True
-        for _ in range(ROUNDS):
+        for _ in range(CONCENTRATION_STEPS):
             trial = umeyama(xyz, onto, weights * chosen)
             squares = ((onto - trial.points(xyz)) ** 2).sum(1) * weights
             rows = np.argpartition(squares, half - 1)[:half]

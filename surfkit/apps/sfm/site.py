@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.sfm.georeference import Chart, Level, Placement, Refused, centres_of, chart_of, place
+from surfkit.apps.sfm.georeference import Levelling, MapProjection, NoSimilarity, Placement, centres_of, chart_of, place
 from surfkit.apps.sfm.level import points_of, turn_upright, up_of
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.plausible import upside_down
@@ -17,11 +17,11 @@ from surfkit.apps.sfm.positions import Positions, no_letters
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.systems import covers
-from surfkit.scene.crs import EGM96, UTM, known_axes
+from surfkit.scene.crs import EGM96, UTM_PATTERN, known_axes
 
 
 @dataclass(frozen=True)
-class Reading:
+class PositionHypothesis:
     """What positions may mean.
 
     Attributes:
@@ -30,7 +30,7 @@ class Reading:
     """
 
     photos: Sequence[Photo]
-    chart: Chart
+    chart: MapProjection
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -43,7 +43,7 @@ class Reading:
         return f"{abs(latitude):.4f} {north} {abs(longitude):.4f} {east} ({self.chart.crs})"
 
 
-def readings(positions: Positions, crs: str) -> list[Reading]:
+def readings(positions: Positions, crs: str) -> list[PositionHypothesis]:
     """What positions may mean, each with its map; one reading where all signs are known, none without positions.
 
     Args:
@@ -64,7 +64,7 @@ def readings(positions: Positions, crs: str) -> list[Reading]:
         try:
             if len(choices) > 1 and crs != "auto" and not covers(crs, *np.median(known[:, :2], axis=0)):
                 raise BadInput(f"--crs {crs} is not meant for where the photographs are, whichever hemisphere it is")
-            found.append(Reading(photos, _chart(known, crs, positions.crs)))
+            found.append(PositionHypothesis(photos, _chart(known, crs, positions.crs)))
         except BadInput as error:
             wrong.append(error)
     if not found:
@@ -72,7 +72,7 @@ def readings(positions: Positions, crs: str) -> list[Reading]:
     return found
 
 
-def _chart(known: np.ndarray, crs: str, listed: str | None) -> Chart:
+def _chart(known: np.ndarray, crs: str, listed: str | None) -> MapProjection:
     if crs == "auto" and listed is not None:
         try:
             return chart_of(known, listed)
@@ -81,7 +81,9 @@ def _chart(known: np.ndarray, crs: str, listed: str | None) -> Chart:
     return chart_of(known, crs)
 
 
-def decide(model: Any, choices: Sequence[Reading], positions: Positions, seed: int) -> Reading | Refused:
+def decide(
+    model: Any, choices: Sequence[PositionHypothesis], positions: Positions, seed: int
+) -> PositionHypothesis | NoSimilarity:
     """The reading that the cameras allow; refused where none or several do.
 
     Args:
@@ -100,12 +102,12 @@ def decide(model: Any, choices: Sequence[Reading], positions: Positions, seed: i
         return good[0]
     remedy = "name the map with --crs, or give the positions with --positions"
     if good:
-        return Refused(f"{letters}, and {' and '.join(map(str, good))} fit alike; {remedy}")
-    reason = next(where.reason for _, where in tried if isinstance(where, Refused))
-    return Refused(f"{letters}, and no sign fits ({reason}); {remedy}")
+        return NoSimilarity(f"{letters}, and {' and '.join(map(str, good))} fit alike; {remedy}")
+    reason = next(where.reason for _, where in tried if isinstance(where, NoSimilarity))
+    return NoSimilarity(f"{letters}, and no sign fits ({reason}); {remedy}")
 
 
-def locate(model: Any, reading: Reading, seed: int) -> Placement | Refused:
+def locate(model: Any, reading: PositionHypothesis, seed: int) -> Placement | NoSimilarity:
     """Where a reconstruction lies by positions; refused where these do not tell, or put it upside down.
 
     Args:
@@ -116,12 +118,12 @@ def locate(model: Any, reading: Reading, seed: int) -> Placement | Refused:
     by_name: Mapping[str, Photo] = {photo.name: photo for photo in reading.photos}
     up = up_of(model, by_name)
     turn = turn_upright(up)
-    level = Level(turn, float(np.median(points_of(model) @ turn[2])))
+    level = Levelling(turn, float(np.median(points_of(model) @ turn[2])))
     found = place(centres_of(model), reading.photos, reading.chart, seed, level)
-    if isinstance(found, Refused):
+    if isinstance(found, NoSimilarity):
         return found
     if why := upside_down(model, found.similarity, up, found.chart.metres, found.handed):
-        return Refused(f"by their positions {why}; are latitude and longitude, or their signs, exchanged?")
+        return NoSimilarity(f"by their positions {why}; are latitude and longitude, or their signs, exchanged?")
     return found
 
 
@@ -136,7 +138,7 @@ def heights_named(where: Placement, photos: Sequence[Photo], given: str) -> tupl
     zeros = {photo.exif.zero for photo in photos if photo.name in where.names}
     crs, axes = where.chart.crs, known_axes(where.chart.crs)
     says_height = axes is not None and axes.height_metres is not None
-    if zeros == {"sea level"} and given == "auto" and UTM.fullmatch(crs) and not says_height:
+    if zeros == {"sea level"} and given == "auto" and UTM_PATTERN.fullmatch(crs) and not says_height:
         chart = replace(where.chart, crs=crs + EGM96)
         return replace(where, chart=chart), (
             f"heights are above sea level, as is the rule in EXIF, so the scene is in {chart.crs} (EGM96); where the "

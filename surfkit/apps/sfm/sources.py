@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.frames import Taken, take_frames
+from surfkit.apps.sfm.frames import ExtractedFrames, take_frames
 from surfkit.apps.sfm.photographs import Photo, files_of, known_photographs, look, look_at
 from surfkit.apps.sfm.settings import Settings
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import Shot
-from surfkit.io.datasets.masks import ENDS, check_mask, find_masks, read_mask
-from surfkit.io.datasets.masks import FOLDER as MASKS
-from surfkit.scene.names import PICTURES, is_video
+from surfkit.io.datasets.capture import RawImage
+from surfkit.io.datasets.masks import MASK_SUFFIXES, check_mask, find_masks, read_mask
+from surfkit.io.datasets.masks import MASKS_FOLDER as MASKS
+from surfkit.scene.names import PICTURE_SUFFIXES, is_video
 from surfkit.scene.scene import Mask
 
 
@@ -82,10 +82,10 @@ def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tu
     return sources, photos
 
 
-def _taken(root: Path, folder: Path, settings: Settings) -> dict[str, Taken]:
+def _taken(root: Path, folder: Path, settings: Settings) -> dict[str, ExtractedFrames]:
     """Frames of the videos of a folder, by their names; those that cannot be read are named and left out."""
     files = files_of(root, settings.masks)
-    pictures = {path.with_suffix("").as_posix().lower() for path in files if path.suffix.lower() in PICTURES}
+    pictures = {path.with_suffix("").as_posix().lower() for path in files if path.suffix.lower() in PICTURE_SUFFIXES}
     videos = [path for path in files if is_video(path)]
     if live := [path for path in videos if path.with_suffix("").as_posix().lower() in pictures]:
         names = few([path.name for path in live])
@@ -110,13 +110,13 @@ def _taken(root: Path, folder: Path, settings: Settings) -> dict[str, Taken]:
 
 def _with_masks(sources: Sources, photos: Sequence[Photo], folder: Path) -> tuple[Sources, list[Photo]]:
     """The same with the masks of a folder, or BadInput for one that has not the shape of its photograph."""
-    shots = [Shot(photo.name, np.eye(4), None, sources.path(photo.name)) for photo in photos]
+    shots = [RawImage(photo.name, np.eye(4), None, sources.path(photo.name)) for photo in photos]
     masks = find_masks(sources.root, folder.absolute(), shots)
     masks = {name: mask for name, mask in masks.items() if mask.path.is_relative_to(folder.absolute())}
     if not masks:
         named = "NAME.jpg.png or NAME.png, as the photograph NAME.jpg"
         raise BadInput(f"--masks {folder}: no picture in it has the name of a photograph; call masks {named}")
-    idle = [path.name for path in sorted(folder.absolute().rglob("*")) if path.suffix.lower() in ENDS]
+    idle = [path.name for path in sorted(folder.absolute().rglob("*")) if path.suffix.lower() in MASK_SUFFIXES]
     idle = [name for name in idle if name not in {mask.path.name for mask in masks.values()}]
     if idle:
         emit(Warned(f"--masks {folder}: {len(idle)} masks have the name of no photograph: {few(idle)}"))

@@ -19,22 +19,22 @@ from surfkit.apps.sfm.compare import compare
 from surfkit.apps.sfm.deliver import deliver
 from surfkit.apps.sfm.deliver_masks import deliver_masks
 from surfkit.apps.sfm.engine import load_engine, run
-from surfkit.apps.sfm.features import FEWEST
-from surfkit.apps.sfm.mapping import SMALLEST, read_model
-from surfkit.apps.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look_at
+from surfkit.apps.sfm.features import MIN_FEATURES
+from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, read_model
+from surfkit.apps.sfm.photographs import PHOTOGRAPHS_FILE, Photo, known_photographs, look_at
 from surfkit.apps.sfm.report import model_facts
-from surfkit.apps.sfm.settings import REPORT, WORK, Settings
+from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
 from surfkit.apps.sfm.sources import Sources, with_masks, with_own_masks
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing_folder
-from surfkit.core.stages import Stages, key_of
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.core.stages import StageFolder, key_of
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import find_masks
-from surfkit.io.datasets.panoramas import ALIGN
-from surfkit.io.datasets.placed import Placed
+from surfkit.io.datasets.panoramas import ALIGNMENT_HINT
+from surfkit.io.datasets.placed import Georeference
 from surfkit.io.datasets.read import check_size, read_capture, reader_of
 from surfkit.io.datasets.undistort import check_camera, is_panorama
 from surfkit.scene.photos import photo_size
@@ -60,7 +60,7 @@ class TiePoints:
     @property
     def work(self) -> Path:
         """Folder of what the stages keep."""
-        return self.scene / WORK
+        return self.scene / WORK_FOLDER
 
     def run(self) -> dict[str, Any]:
         """Go through all stages that are not complete; the report.
@@ -74,17 +74,17 @@ class TiePoints:
         if whole := [shot.name for shot in capture.shots if is_panorama(shot.camera)]:
             raise BadInput(
                 f"{self.data.path}: {len(whole)} panoramas, {few(whole)}: points are triangulated between perspective "
-                f"photographs only; {ALIGN}"
+                f"photographs only; {ALIGNMENT_HINT}"
             )
         root, shots = _by_path(capture)
         self._tell_what_is_lost(capture)
-        stages = Stages(self.work)
+        stages = StageFolder(self.work)
         sources, photos = stages.run("photographs", "", lambda: self._look(root, shots))
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
         found = compare(stages, photos, sources, self.work, self.settings, self.device, cameras, poses)
-        if poor := [name for name, count in found.counts.items() if count < FEWEST]:
+        if poor := [name for name, count in found.counts.items() if count < MIN_FEATURES]:
             emit(Warned(f"{len(poor)} of {len(photos)} photographs have hardly any features: {few(poor)} are left out"))
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])
         models = self.work / "points"
@@ -96,7 +96,7 @@ class TiePoints:
                 f"{self.data.path}: not one point could be triangulated: the photographs share no features that fit "
                 "their cameras; are these the cameras of these photographs?"
             )
-        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres)
+        placed = None if capture.crs is None else Georeference(capture.crs, tuple(offset.tolist()), capture.metres)
         if placed is None:  # no file to keep an offset in
             model.transform(load_engine().Sim3d(1.0, load_engine().Rotation3d(), offset))
         by_name = {photo.name: photo for photo in photos}
@@ -108,10 +108,10 @@ class TiePoints:
             "seconds": stages.seconds(),
             "settings": self.settings,
         }
-        write_json(self.scene / REPORT, report)
+        write_json(self.scene / REPORT_FILE, report)
         return report
 
-    def _tell_what_is_lost(self, capture: Capture) -> None:
+    def _tell_what_is_lost(self, capture: RawDataset) -> None:
         """Say what of the data set the new one has not."""
         if capture.held_out:
             named = few(sorted(capture.held_out))
@@ -119,9 +119,9 @@ class TiePoints:
         if capture.metres and capture.crs is None and capture.metres != 1:
             emit(Warned(f"the unit is not taken over: give --metres-per-unit {capture.metres:g} when you train"))
 
-    def _look(self, root: Path, shots: Mapping[str, Shot]) -> tuple[Sources, list[Photo]]:
+    def _look(self, root: Path, shots: Mapping[str, RawImage]) -> tuple[Sources, list[Photo]]:
         """The photographs of the data set that can be used, and where they and their masks are."""
-        path, data = self.work / PHOTOGRAPHS, self.data
+        path, data = self.work / PHOTOGRAPHS_FILE, self.data
         paths = [root / name for name in sorted(shots)]
         photos = look_at(root, paths, known_photographs(path), data.alpha, ("--alpha",))
         known = find_masks(data.path, data.masks, list(shots.values()))
@@ -131,13 +131,13 @@ class TiePoints:
         if wrong := [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]:
             emit(Warned(f"{len(wrong)} of {len(photos)} photographs cannot be used, and are left out: {few(wrong)}"))
         usable = [photo for photo in photos if photo.usable]
-        if len(usable) < SMALLEST:
+        if len(usable) < MIN_MODEL_PHOTOS:
             raise BadInput(
-                f"{root}: {len(usable)} of {len(photos)} photographs can be used; {SMALLEST} or more are needed"
+                f"{root}: {len(usable)} of {len(photos)} photographs can be used; {MIN_MODEL_PHOTOS} or more are needed"
             )
         return sources, usable
 
-    def _deliver(self, model: Any, placed: Placed | None, photos: dict[str, Photo], sources: Sources) -> None:
+    def _deliver(self, model: Any, placed: Georeference | None, photos: dict[str, Photo], sources: Sources) -> None:
         """Write photographs, masks and the model of the data set."""
         deliver_masks([model], photos, sources, self.scene, self.work)
         deliver([(model, placed)], photos, sources, self.scene, self.work)
@@ -164,7 +164,7 @@ class TiePoints:
         return read_model(self.work / "points" / "0")
 
 
-def _by_path(capture: Capture) -> tuple[Path, dict[str, Shot]]:
+def _by_path(capture: RawDataset) -> tuple[Path, dict[str, RawImage]]:
     """The folder that all photographs of a data set are in, and what is known of each by its path below that."""
     paths = [Path(os.path.abspath(shot.path)) for shot in capture.shots]
     root = Path(os.path.commonpath([path.parent for path in paths]))
@@ -187,7 +187,7 @@ def _without_points(engine: Any, database: Path, poses: Mapping[str, np.ndarray]
     return model
 
 
-def _camera(shot: Shot, size: tuple[int, int]) -> Any:
+def _camera(shot: RawImage, size: tuple[int, int]) -> Any:
     """The camera of a photograph of a size, or BadInput where these do not fit."""
     check_camera(shot.camera, shot.name)
     check_size(shot, photo_size(shot.path))
@@ -198,7 +198,7 @@ def _camera(shot: Shot, size: tuple[int, int]) -> Any:
     return made
 
 
-def _offset(capture: Capture) -> np.ndarray:
+def _offset(capture: RawDataset) -> np.ndarray:
     """(3,) what coordinates of the model leave out."""
     if capture.shift is not None:
         return np.array(capture.shift, np.float64)

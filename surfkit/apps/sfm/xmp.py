@@ -6,16 +6,18 @@ import math
 import re
 from collections.abc import Callable
 
-FIELD = re.compile(r"([A-Za-z][\w.-]*):(\w+)(?:\s*=\s*[\"']|>)\s*([^\"'<>]*?)\s*(?=[\"'<])")
+FIELD_PATTERN = re.compile(r"([A-Za-z][\w.-]*):(\w+)(?:\s*=\s*[\"']|>)\s*([^\"'<>]*?)\s*(?=[\"'<])")
 """Prefix, name and value, as an attribute or an element."""
-ANGLE = re.compile(r"([-+]?)(\d+(?:\.\d*)?)(?:,(\d+(?:\.\d*)?))?(?:,(\d+(?:\.\d*)?))?\s*([NSEW]?)", re.IGNORECASE)
+ANGLE_PATTERN = re.compile(
+    r"([-+]?)(\d+(?:\.\d*)?)(?:,(\d+(?:\.\d*)?))?(?:,(\d+(?:\.\d*)?))?\s*([NSEW]?)", re.IGNORECASE
+)
 """Signed degrees as DJI writes them, "+52.1"; degrees and minutes, or seconds too, and a letter as in the standard:
 "52,6.5N", "52,6,30N"."""
 DRONES = ("drone-dji", "Camera")
 """Prefixes of DJI, and of Pix4D's convention that Parrot, senseFly and others follow: all their numbers are kept."""
 LATITUDE, LONGITUDE, ALTITUDE, ABOVE_START = "latitude", "longitude", "altitude", "above start"
 """Names under which positions are kept, degrees and metres."""
-NAMES = {
+FIELD_NAMES = {
     "gpslatitude": LATITUDE,
     "gpslongitude": LONGITUDE,
     "gpslongtitude": LONGITUDE,  # of older DJI drones
@@ -24,11 +26,11 @@ NAMES = {
     "relativealtitude": ABOVE_START,
 }
 """By the name in small letters, under any prefix: drone-dji, drone (Autel), drone-parrot, exif and others."""
-PLAIN = {"latitude": LATITUDE, "longitude": LONGITUDE}
+DRONE_FIELD_NAMES = {"latitude": LATITUDE, "longitude": LONGITUDE}
 """Names that count under a prefix of a drone only, as Skydio's."""
-PANORAMAS = ("equirectangular", "cylindrical")
+PANORAMA_PROJECTIONS = ("equirectangular", "cylindrical")
 """Projections of photographs that no lens takes, as GPano:ProjectionType names them."""
-MOST = {LATITUDE: 90.0, LONGITUDE: 180.0, ALTITUDE: 1e5, ABOVE_START: 1e5}
+MAX_FIELD_VALUES = {LATITUDE: 90.0, LONGITUDE: 180.0, ALTITUDE: 1e5, ABOVE_START: 1e5}
 
 
 def read_xmp(packet: bytes | str | None) -> dict[str, float]:
@@ -40,30 +42,31 @@ def read_xmp(packet: bytes | str | None) -> dict[str, float]:
         small = name.lower()
         if prefix in DRONES and (number := _number(value)) is not None:
             found[name] = number
-        what = NAMES.get(small) or (PLAIN.get(small) if prefix.startswith("drone") else None)
+        what = FIELD_NAMES.get(small) or (DRONE_FIELD_NAMES.get(small) if prefix.startswith("drone") else None)
         if what is None or (what == ALTITUDE and small == "gpsaltitude" and ALTITUDE in found):
             continue
         read: Callable[[str], float | None] = _angle if what in (LATITUDE, LONGITUDE) else _fraction
-        if (number := read(value)) is not None and abs(number) <= MOST[what]:
+        if (number := read(value)) is not None and abs(number) <= MAX_FIELD_VALUES[what]:
             found[what] = -abs(number) if what == ALTITUDE and small == "gpsaltitude" and below else number
     return found
 
 
 def panorama_kind(packet: bytes | str | None) -> str | None:
-    """The projection of a panorama by its XMP packet, one of `PANORAMAS`; None for a photograph of a lens."""
+    """The projection of a panorama by its XMP packet, one of `PANORAMA_PROJECTIONS`; None for a photograph of a
+    lens."""
     said = [value.lower() for _, name, value in _fields(packet) if name == "ProjectionType"]
-    return said[0] if said and said[0] in PANORAMAS else None
+    return said[0] if said and said[0] in PANORAMA_PROJECTIONS else None
 
 
 def _fields(packet: bytes | str | None) -> list[tuple[str, str, str]]:
     """Prefix, name and value of each field of a packet."""
     text = packet or ""
-    return FIELD.findall(text if isinstance(text, str) else text.decode("utf-8", "replace"))
+    return FIELD_PATTERN.findall(text if isinstance(text, str) else text.decode("utf-8", "replace"))
 
 
 def _angle(text: str) -> float | None:
     """Degrees, or None; without a sign or a letter only a decimal number has one."""
-    if not (found := ANGLE.fullmatch(text)):
+    if not (found := ANGLE_PATTERN.fullmatch(text)):
         return None
     sign, degrees, minutes, seconds, letter = found.groups()
     if minutes is not None and not (letter or sign):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.apps.texture.exposure import BRIGHT, NONE, exposed
-from surfkit.apps.texture.look import Sight
+from surfkit.apps.texture.exposure import MAX_USABLE_COLOR, NO_PHOTO, exposed
+from surfkit.apps.texture.look import TriangleVisibility
 
-MOST = 8
+MAX_PHOTOS_PER_TRIANGLE = 8
 """Photographs that are remembered for a triangle: those that show it best."""
-AWAY, SPREADS = 0.08, 3.0
+MIN_OUTLIER_DISTANCE, OUTLIER_DISTANCE_MEDIANS = 0.08, 3.0
 """A colour that is further from the median of all photographs than this, and than so many times the median distance,
 shows something else, such as a car that has moved."""
-CLIPPED = 0.1
+CLIPPED_QUALITY = 0.1
 """What the quality of a photograph of a triangle is multiplied by that shows it white: others may show its colour."""
 
 
@@ -26,11 +26,11 @@ class Candidates:
     """
 
     def __init__(self, count: int) -> None:
-        self.view = np.full((count, MOST), NONE, np.int32)
-        self.quality = np.zeros((count, MOST), np.float32)
-        self.color = np.zeros((count, MOST, 3), np.uint8)
+        self.view = np.full((count, MAX_PHOTOS_PER_TRIANGLE), NO_PHOTO, np.int32)
+        self.quality = np.zeros((count, MAX_PHOTOS_PER_TRIANGLE), np.float32)
+        self.color = np.zeros((count, MAX_PHOTOS_PER_TRIANGLE, 3), np.uint8)
 
-    def offer(self, view: int, sight: Sight) -> None:
+    def offer(self, view: int, sight: TriangleVisibility) -> None:
         """Take what a photograph shows, where it is better than the worst that is known."""
         worst = self.quality[sight.faces].argmin(1)
         better = sight.quality > self.quality[sight.faces, worst]
@@ -41,7 +41,7 @@ class Candidates:
 
     def shun_clipped(self) -> None:
         """Let photographs in which a triangle is white count less."""
-        self.quality[(self.color > BRIGHT).any(2)] *= np.float32(CLIPPED)
+        self.quality[(self.color > MAX_USABLE_COLOR).any(2)] *= np.float32(CLIPPED_QUALITY)
 
     def refuse_outliers(self, gains: np.ndarray) -> int:
         """Forget photographs of a triangle in which it has another colour than in most; how many.
@@ -54,14 +54,16 @@ class Candidates:
         refused = 0
         for at in range(0, len(self.view), 1 << 18):
             part = slice(at, at + (1 << 18))
-            there = self.view[part] != NONE
+            there = self.view[part] != NO_PHOTO
             color = exposed(self.color[part] / np.float32(255), gains[self.view[part]].astype(np.float32))
             color[~there] = np.nan
             rows = np.flatnonzero(there.sum(1) >= 3)
             away = np.abs(color[rows] - np.nanmedian(color[rows], axis=1, keepdims=True)).max(2)
-            limit = np.maximum(AWAY, SPREADS * np.nanmedian(away, axis=1, keepdims=True))
+            limit = np.maximum(
+                MIN_OUTLIER_DISTANCE, OUTLIER_DISTANCE_MEDIANS * np.nanmedian(away, axis=1, keepdims=True)
+            )
             row, slot = np.nonzero(away > limit)
-            self.view[rows[row] + at, slot] = NONE
+            self.view[rows[row] + at, slot] = NO_PHOTO
             self.quality[rows[row] + at, slot] = 0
             refused += len(row)
         return refused

@@ -11,25 +11,25 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from surfkit.apps.texture.candidates import NONE
-from surfkit.apps.texture.topology import NONE as NO_FACE
+from surfkit.apps.texture.candidates import NO_PHOTO
+from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 
-CELL = 256
+CUT_CELL_PX = 256
 """Charts that are larger are cut along a grid of so many pixels: smaller pieces leave less room empty."""
 PAD = 2
 """Texels around a chart: what is mixed with it when a page is shown reduced to a quarter is a copy of its rim."""
-PATCH = 4
+PATCH_SIDE = 4
 """Side of the square of texels of a triangle without a photograph."""
-PATCHES = 64
+MAX_PATCHES_PER_SIDE = 64
 """Such squares along the side of a chart of them, at most."""
-FULL = 0.6
+MAX_FILLED_SHARE = 0.6
 """Share of a page that is estimated to be taken, at most."""
-SMALLEST = 64
+MIN_PAGE_SIDE = 64
 """Side of a page."""
 
 
 @dataclass(frozen=True)
-class Page:
+class AtlasPage:
     """A picture of the atlas.
 
     Attributes:
@@ -63,7 +63,7 @@ class Atlas:
     tile: np.ndarray
     page: np.ndarray
     move: np.ndarray
-    pages: list[Page]
+    pages: list[AtlasPage]
 
     def texels(self, faces: np.ndarray) -> np.ndarray:
         """(n, 3, 2) float32 x and y of the corners of some triangles on their page."""
@@ -86,7 +86,7 @@ def make_atlas(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: n
     first = np.flatnonzero(np.diff(chart[order], prepend=-1))
     low = np.floor(np.minimum.reduceat(places.min(1)[order], first)).astype(np.int64) - PAD
     high = np.ceil(np.maximum.reduceat(places.max(1)[order], first)).astype(np.int64) + PAD
-    alone = view[order[first]] == NONE
+    alone = view[order[first]] == NO_PHOTO
     low[alone], high[alone] = 0, high[alone] - PAD + 1  # patches have their rims: up to their fourth texel
     size, owner = high - low, tile[order[first]]
     page, corner, pages = np.zeros(len(first), np.int32), np.zeros((len(first), 2), np.int64), []
@@ -96,14 +96,14 @@ def make_atlas(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: n
             continue
         at, corner[rows], shapes = packed(size[rows], side)
         page[rows] = at + len(pages)
-        pages += [Page(number, *shape) for shape in shapes]
+        pages += [AtlasPage(number, *shape) for shape in shapes]
     return Atlas(view, chart, places, tile, page, corner - low, pages)
 
 
 def _charts(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: np.ndarray, side: int) -> np.ndarray:
     """(F,) int32 number of the chart of each triangle; places of those without a photograph are set."""
-    seen, patches = view != NONE, min(PATCHES, side // PATCH)
-    grid = np.floor(places.mean(1) / min(CELL, side // 4)).astype(np.int64)
+    seen, patches = view != NO_PHOTO, min(MAX_PATCHES_PER_SIDE, side // PATCH_SIDE)
+    grid = np.floor(places.mean(1) / min(CUT_CELL_PX, side // 4)).astype(np.int64)
     same = (beyond != NO_FACE) & seen[:, None] & (view[:, None] == view[beyond]) & (tile[:, None] == tile[beyond])
     same &= (grid[:, None] == grid[beyond]).all(2)
     row, edge = np.nonzero(same)
@@ -116,7 +116,7 @@ def _charts(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: np.n
     part[alone] = len(view) + (begins + within // patches**2)  # blocks of a tile begin at different numbers
     row, column = np.divmod(within % patches**2, patches)
     corner = np.array([[1.5, 1.5], [2.5, 1.5], [1.5, 2.5]])
-    places[alone] = PATCH * np.stack([column, row], axis=1)[:, None] + corner
+    places[alone] = PATCH_SIDE * np.stack([column, row], axis=1)[:, None] + corner
     return np.unique(part, return_inverse=True)[1].astype(np.int32)
 
 
@@ -129,7 +129,7 @@ def packed(size: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, list[tu
         size: (C, 2) width and height, at most `side`.
         side: Largest page, a power of two.
     """
-    wanted = SMALLEST
+    wanted = MIN_PAGE_SIDE
     while wanted < side and (wanted < size.max() or wanted**2 < size.prod(1).sum()):
         wanted *= 2
     while True:
@@ -137,7 +137,7 @@ def packed(size: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, list[tu
         if page.max() == 0 or wanted >= side:
             break
         wanted *= 2
-    height = SMALLEST
+    height = MIN_PAGE_SIDE
     while height < rows:  # of the last page
         height *= 2
     return page, corner, [(wanted, wanted)] * int(page.max()) + [(wanted, min(height, wanted))]
@@ -162,4 +162,4 @@ def texels_of(view: np.ndarray, places: np.ndarray) -> np.ndarray:
     """(F,) estimate of the texels that triangles take on a page, with their shares of rims and gaps."""
     ahead, across = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
     area = np.abs(ahead[:, 0] * across[:, 1] - ahead[:, 1] * across[:, 0]) / 2
-    return np.where(view == NONE, PATCH**2, 1.5 * area + 2).astype(np.float64)
+    return np.where(view == NO_PHOTO, PATCH_SIDE**2, 1.5 * area + 2).astype(np.float64)

@@ -13,19 +13,19 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from surfkit.apps.texture.candidates import NONE, Candidates
-from surfkit.apps.texture.topology import NONE as NO_FACE
+from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
+from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
 
-SEAM = 2.0
+SEAM_COST = 2.0
 """Cost of an edge between two photographs; that of a triangle is the share of the best quality that it lacks."""
-ROUNDS = 20
+MESSAGE_ROUNDS = 20
 """Of messages between neighbours."""
 DAMPING = 0.5
 """Share of a message that stays as it was."""
-CHANGES = 16
+CHANGE_ROUNDS = 16
 """Rounds of changes of connected triangles, each of about half of them: neighbours must not change together."""
-LARGE = 1e3
+UNSEEN_COST = 1e3
 """Cost of a photograph that does not show the triangle."""
 PART = 1 << 17
 """Triangles at once."""
@@ -41,9 +41,9 @@ def choose_views(found: Candidates, beyond: np.ndarray, edge: np.ndarray) -> np.
     """
     best = found.quality.max(1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cost = np.where(found.view != NONE, 1 - found.quality / best, LARGE).astype(np.float32)
+        cost = np.where(found.view != NO_PHOTO, 1 - found.quality / best, UNSEEN_COST).astype(np.float32)
     message = np.zeros((*beyond.shape, found.view.shape[1]), np.float32)
-    for turn in range(ROUNDS):
+    for turn in range(MESSAGE_ROUNDS):
         total = cost + message.sum(1)
         after = np.empty_like(message)
         for at in range(0, len(cost), PART):
@@ -53,11 +53,11 @@ def choose_views(found: Candidates, beyond: np.ndarray, edge: np.ndarray) -> np.
         message *= DAMPING  # in place: it is the largest array of all
         after *= 1 - DAMPING
         message += after
-        emit(Progress("choosing photographs", turn + 1, ROUNDS))
+        emit(Progress("choosing photographs", turn + 1, MESSAGE_ROUNDS))
     slot = (cost + message.sum(1)).argmin(1)
-    chosen = np.where(found.view.max(1) == NONE, NONE, found.view[np.arange(len(slot)), slot]).astype(np.int32)
+    chosen = np.where(found.view.max(1) == NO_PHOTO, NO_PHOTO, found.view[np.arange(len(slot)), slot]).astype(np.int32)
     draw = np.random.default_rng(0)
-    for _ in range(CHANGES):
+    for _ in range(CHANGE_ROUNDS):
         chosen = _changed(chosen, found.view, cost, beyond, draw)
     return chosen
 
@@ -76,12 +76,12 @@ def _messages(
     # what the neighbour would cost with each of its photographs, without what it was told from here
     theirs = total[there] - message[there, edge[part, side]]
     least = theirs.min(1, keepdims=True)
-    found = np.broadcast_to(least + np.float32(SEAM), theirs.shape).copy()
+    found = np.broadcast_to(least + np.float32(SEAM_COST), theirs.shape).copy()
     for slot in range(view.shape[1]):
-        same = (view[part] == view[there, slot][:, None]) & (view[part] != NONE)
+        same = (view[part] == view[there, slot][:, None]) & (view[part] != NO_PHOTO)
         found = np.where(same, np.minimum(found, theirs[:, slot, None]), found)
     found -= least
-    found[(there == NO_FACE) | (view[there].max(1) == NONE)] = 0
+    found[(there == NO_FACE) | (view[there].max(1) == NO_PHOTO)] = 0
     return found
 
 
@@ -89,31 +89,31 @@ def _changed(
     chosen: np.ndarray, view: np.ndarray, cost: np.ndarray, beyond: np.ndarray, draw: np.random.Generator
 ) -> np.ndarray:
     """The same after connected triangles took the photograph of a neighbour, where that lowers the energy most."""
-    face, edge = np.nonzero((beyond != NO_FACE) & (chosen != NONE)[:, None])
+    face, edge = np.nonzero((beyond != NO_FACE) & (chosen != NO_PHOTO)[:, None])
     there = beyond[face, edge]
     same = chosen[face] == chosen[there]
     graph = coo_matrix((np.ones(same.sum(), bool), (face[same], there[same])), (len(chosen), len(chosen)))
     part = connected_components(graph, directed=False)[1].astype(np.int64)
     size, stride = np.bincount(part), int(view.max()) + 2
     # what each part saves by the photograph of a neighbour: its seams with it, and what its triangles cost now
-    seam = np.flatnonzero(~same & (chosen[there] != NONE))
+    seam = np.flatnonzero(~same & (chosen[there] != NO_PHOTO))
     wanted, count = np.unique(part[face[seam]] * stride + chosen[there[seam]], return_counts=True)
     if not len(wanted):
         return chosen
-    own = np.where(view == chosen[:, None], cost, LARGE).min(1)
+    own = np.where(view == chosen[:, None], cost, UNSEEN_COST).min(1)
     now = np.bincount(part, own)
-    row, slot = np.nonzero(view != NONE)
+    row, slot = np.nonzero(view != NO_PHOTO)
     key = part[row] * stride + view[row, slot]
     at = np.searchsorted(wanted, key).clip(max=len(wanted) - 1)
     hit = wanted[at] == key
     then = np.bincount(at[hit], cost[row[hit], slot[hit]], len(wanted))
     shown = np.bincount(at[hit], minlength=len(wanted))
     owner, label = np.divmod(wanted, stride)
-    change = then - now[owner] - SEAM * count
+    change = then - now[owner] - SEAM_COST * count
     usable = np.flatnonzero((shown == size[owner]) & (change < -1e-6))
     usable = usable[np.lexsort((change[usable], owner[usable]))]
     usable = usable[np.diff(owner[usable], prepend=-1) > 0]  # the best of each part
     usable = usable[draw.random(len(usable)) < 0.5]
-    to = np.full(len(size), NONE, np.int64)
+    to = np.full(len(size), NO_PHOTO, np.int64)
     to[owner[usable]] = label[usable]
-    return np.where(to[part] != NONE, to[part], chosen).astype(np.int32)
+    return np.where(to[part] != NO_PHOTO, to[part], chosen).astype(np.int32)

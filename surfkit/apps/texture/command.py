@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.texture.make import RECORD, Subject, TextureSettings, make_texture
+from surfkit.apps.texture.make import TEXTURE_RECORD, MeshWithPhotos, TextureSettings, make_texture
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_mesh
@@ -24,7 +24,7 @@ from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
-class TextureOf:
+class TextureCommand:
     """Give the mesh of a finished run a texture from the photographs; writes OBJ, GLB and 3D Tiles into RUN/texture.
 
     Each triangle takes its picture from one photograph that shows it whole, well, and in the colour that others show
@@ -67,7 +67,7 @@ class TextureOf:
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
-            record = make_texture(Subject(read_mesh(run.mesh), frame, scene.train), self.settings, out, budget)
+            record = make_texture(MeshWithPhotos(read_mesh(run.mesh), frame, scene.train), self.settings, out, budget)
             note_held_out(run, scene)
         show(out, record)
 
@@ -88,7 +88,7 @@ def show(out: Path, record: dict[str, Any]) -> None:
     ]
     print_table(("textured mesh", "value"), rows)
     print()
-    print_table(("written",), [(str(out / name),) for name in (*record["files"], RECORD)])
+    print_table(("written",), [(str(out / name),) for name in (*record["files"], TEXTURE_RECORD)])
 
 
-COMMAND = TextureOf
+COMMAND = TextureCommand

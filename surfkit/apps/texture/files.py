@@ -13,14 +13,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from surfkit.apps.texture.candidates import NONE
+from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.charts import Atlas
 from surfkit.apps.texture.fill import Pictures
 from surfkit.core.version import own_version
-from surfkit.io.glb import FLOAT, INDICES, INT, UNLIT, VERTICES, Blocks, write_glb
+from surfkit.io.glb import FLOAT, INDICES, UNLIT, UNSIGNED_INT, VERTICES, GlbWriter, write_glb
 from surfkit.mesh.base import Mesh
 
-CHUNK = 1 << 20
+BATCH_ROWS = 1 << 20
 """Rows that are written at once."""
 LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
 SUFFIX = {"jpeg": "jpg", "png": "png"}
@@ -30,7 +30,7 @@ Place = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Part:
+class AtlasPageMesh:
     """The triangles of one page.
 
     Attributes:
@@ -46,20 +46,20 @@ class Part:
     numbers: np.ndarray
 
 
-def part_of(mesh: Mesh, atlas: Atlas, page: int, numbers: np.ndarray) -> Part:
+def part_of(mesh: Mesh, atlas: Atlas, page: int, numbers: np.ndarray) -> AtlasPageMesh:
     """The triangles `numbers` of a page."""
     vertices, chart = mesh.faces[numbers].astype(np.int64), atlas.chart[numbers].astype(np.int64)[:, None]
-    alone = (atlas.view[numbers] == NONE)[:, None]  # these share no corner
+    alone = (atlas.view[numbers] == NO_PHOTO)[:, None]  # these share no corner
     own = np.arange(vertices.size).reshape(-1, 3) + len(atlas.page)
     key = np.where(alone, own, chart) * len(mesh.vertices) + vertices
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
     shape = np.array([atlas.pages[page].width, atlas.pages[page].height], np.float32)
     uv = atlas.texels(numbers).reshape(-1, 2)[first] / shape
-    return Part(vertices.ravel()[first], uv, faces.reshape(-1, 3).astype(np.int32), numbers)
+    return AtlasPageMesh(vertices.ravel()[first], uv, faces.reshape(-1, 3).astype(np.int32), numbers)
 
 
 def write_obj(
-    file: BinaryIO, mesh: Mesh, parts: Sequence[Part], place: Place, materials: str, notes: list[str]
+    file: BinaryIO, mesh: Mesh, parts: Sequence[AtlasPageMesh], place: Place, materials: str, notes: list[str]
 ) -> None:
     """OBJ with a material for each page, `page0`, `page1` and so on.
 
@@ -73,18 +73,18 @@ def write_obj(
     """
     file.write("".join(f"# {note}\n" for note in notes).encode())
     file.write(f"mtllib {materials}\n".encode())
-    for at in range(0, len(mesh.vertices), CHUNK):
-        rows = place(mesh.vertices[at : at + CHUNK]).tolist()
+    for at in range(0, len(mesh.vertices), BATCH_ROWS):
+        rows = place(mesh.vertices[at : at + BATCH_ROWS]).tolist()
         file.write("".join([f"v {x:.10g} {y:.10g} {z:.10g}\n" for x, y, z in rows]).encode())
     for part in parts:
-        for at in range(0, len(part.uv), CHUNK):
-            rows = part.uv[at : at + CHUNK].astype(np.float64).tolist()
+        for at in range(0, len(part.uv), BATCH_ROWS):
+            rows = part.uv[at : at + BATCH_ROWS].astype(np.float64).tolist()
             file.write("".join([f"vt {u:.7g} {1 - v:.7g}\n" for u, v in rows]).encode())
     start = 1
     for number, part in enumerate(parts):
         file.write(f"usemtl page{number}\n".encode())
-        for at in range(0, len(part.faces), CHUNK):
-            faces = part.faces[at : at + CHUNK]
+        for at in range(0, len(part.faces), BATCH_ROWS):
+            faces = part.faces[at : at + BATCH_ROWS]
             rows = np.stack([part.vertices[faces] + 1, faces + start], axis=2).reshape(-1, 6).tolist()
             file.write("".join([f"f {a}/{b} {c}/{d} {e}/{f}\n" for a, b, c, d, e, f in rows]).encode())
         start += len(part.uv)
@@ -101,7 +101,7 @@ def material_lines(names: Sequence[str]) -> str:
 def write_textured_glb(
     path: Path,
     mesh: Mesh,
-    parts: Sequence[Part],
+    parts: Sequence[AtlasPageMesh],
     pages: Sequence[Path],
     kind: Pictures,
     place: Place,
@@ -123,7 +123,7 @@ def write_textured_glb(
     Raises:
         BadInput: More than 4 GiB.
     """
-    blocks, primitives, images, corners = Blocks(), [], [], []
+    blocks, primitives, images, corners = GlbWriter(), [], [], []
     for at, (part, page) in enumerate(zip(parts, pages, strict=True)):
         xyz = place(mesh.vertices[part.vertices]).astype("<f4")
         corners += [xyz.min(0), xyz.max(0)]
@@ -149,7 +149,7 @@ def write_textured_glb(
     return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)]).astype(np.float64)
 
 
-def _add_part(blocks: Blocks, xyz: np.ndarray, part: Part) -> dict[str, Any]:
+def _add_part(blocks: GlbWriter, xyz: np.ndarray, part: AtlasPageMesh) -> dict[str, Any]:
     """The primitive of a page, with (V, 3) float32 coordinates of its vertices, whose bytes are added to a file."""
     count = len(xyz)
     view = blocks.add(xyz.nbytes, xyz.tobytes, target=VERTICES)
@@ -158,7 +158,7 @@ def _add_part(blocks: Blocks, xyz: np.ndarray, part: Part) -> dict[str, Any]:
     view = blocks.add(8 * count, part.uv.astype("<f4").tobytes, target=VERTICES)
     texcoord = blocks.accessor(view, componentType=FLOAT, count=count, type="VEC2")
     view = blocks.add(4 * part.faces.size, part.faces.astype("<u4").tobytes, target=INDICES)
-    indices = blocks.accessor(view, componentType=INT, count=part.faces.size, type="SCALAR")
+    indices = blocks.accessor(view, componentType=UNSIGNED_INT, count=part.faces.size, type="SCALAR")
     return {"attributes": {"POSITION": position, "TEXCOORD_0": texcoord}, "indices": indices}
 
 

@@ -10,25 +10,25 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from surfkit.apps.texture.candidates import NONE
-from surfkit.apps.texture.charts import PATCH, Atlas, Page
+from surfkit.apps.texture.candidates import NO_PHOTO
+from surfkit.apps.texture.charts import PATCH_SIDE, Atlas, AtlasPage
 from surfkit.apps.texture.exposure import exposed, levelled
-from surfkit.apps.texture.level import Levels
-from surfkit.apps.texture.photographs import Photographs, by_photograph
+from surfkit.apps.texture.level import SeamCorrections
+from surfkit.apps.texture.photographs import PrefetchedPhotos, by_photograph
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 
 Pictures = Literal["jpeg", "png"]
-QUALITY = 92
+PAGE_JPEG_QUALITY = 92
 """Of JPEG pages; colours are kept at full resolution, as charts end at any texel."""
-GREY = 128
+UNSEEN_GREY = 128
 """Colour of a mesh without colours, where no photograph shows it."""
-AT_ONCE = 1 << 20
+BATCH_TEXELS = 1 << 20
 """Texels whose colour is computed at once."""
 
 
 @dataclass(frozen=True)
-class Paint:
+class PaintInput:
     """What pages are painted with.
 
     Attributes:
@@ -41,12 +41,12 @@ class Paint:
 
     mesh: Mesh
     atlas: Atlas
-    photos: Photographs
+    photos: PrefetchedPhotos
     gains: np.ndarray
-    levels: Levels
+    levels: SeamCorrections
 
 
-def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
+def paint(what: PaintInput, page: AtlasPage, faces: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8 page with some triangles; every other texel has the colour of the nearest one of these.
 
     Args:
@@ -58,7 +58,7 @@ def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
     image = np.zeros((page.height, page.width, 3), np.uint8)
     flat = np.concatenate([corners.reshape(-1, 2), np.ones((3 * len(faces), 1), np.float32)], axis=1)
     owner = draw_faces(flat, np.arange(3 * len(faces), dtype=np.int32).reshape(-1, 3), page.width, page.height)[1]
-    seen = what.atlas.view[faces] != NONE
+    seen = what.atlas.view[faces] != NO_PHOTO
     column, row = np.floor(corners.mean(1)).astype(np.int64).T
     free = np.flatnonzero(seen & (owner[row, column] < 0))  # triangles between the centres of texels
     owner[row[free], column[free]] = free
@@ -67,8 +67,8 @@ def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
     texel = np.flatnonzero(owner >= 0)
     for number, rows in by_photograph(views[owner.reshape(-1)[texel]]):
         picture = what.photos(number)
-        for at in range(0, len(rows), AT_ONCE):
-            some = texel[rows[at : at + AT_ONCE]]
+        for at in range(0, len(rows), BATCH_TEXELS):
+            some = texel[rows[at : at + BATCH_TEXELS]]
             image.reshape(-1, 3)[some] = _colors(what, number, picture, faces, corners, owner, some)
     _patch(what, image, owner, faces[~seen], corners[~seen])
     if (owner < 0).any() and (owner >= 0).any():
@@ -78,7 +78,7 @@ def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
 
 
 def _colors(
-    what: Paint,
+    what: PaintInput,
     number: int,
     picture: np.ndarray,
     faces: np.ndarray,
@@ -104,19 +104,19 @@ def _colors(
     return levelled(shown, (value * shares[:, :, None]).sum(1) / shares.sum(1, keepdims=True))
 
 
-def _patch(what: Paint, image: np.ndarray, owner: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> None:
+def _patch(what: PaintInput, image: np.ndarray, owner: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> None:
     """Paint the squares of triangles without a photograph: between the middles of texels, a square has the colours
     of the corners at three of them."""
     if not len(faces):
         return
     if what.mesh.colors is None:
-        color = np.full((len(faces), 3, 3), GREY, np.int64)
+        color = np.full((len(faces), 3, 3), UNSEEN_GREY, np.int64)
     else:
         color = what.mesh.colors[what.mesh.faces[faces]].astype(np.int64)
     left, top = np.floor(corners[:, 0]).astype(np.int64).T - 1
     quad = np.stack([color[:, 0], color[:, 1], color[:, 2], (color[:, 1] + color[:, 2] - color[:, 0]).clip(0, 255)])
-    for i in range(PATCH):
-        for j in range(PATCH):
+    for i in range(PATCH_SIDE):
+        for j in range(PATCH_SIDE):
             image[top + i, left + j] = quad[(j >= 2) + 2 * (i >= 2)]
             owner[top + i, left + j] = 0
 
@@ -124,6 +124,6 @@ def _patch(what: Paint, image: np.ndarray, owner: np.ndarray, faces: np.ndarray,
 def encoded(image: np.ndarray, kind: Pictures) -> bytes:
     """A page as a file."""
     with io.BytesIO() as file:
-        options = {"quality": QUALITY, "subsampling": 0} if kind == "jpeg" else {}
+        options = {"quality": PAGE_JPEG_QUALITY, "subsampling": 0} if kind == "jpeg" else {}
         Image.fromarray(image).save(file, kind, **options)
         return file.getvalue()

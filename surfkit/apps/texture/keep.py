@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.files import replacing
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.scene.scene import View
 
-BLOCK = 1 << 20
+BATCH_ROWS = 1 << 20
 """Rows that are looked at at once."""
 Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Kept:
+class TextureCache:
     """Arrays by name.
 
     Attributes:
@@ -31,7 +31,7 @@ class Kept:
     folder: Path | None = None
     level: int = 0
 
-    def of(self, level: int) -> Kept:
+    def of(self, level: int) -> TextureCache:
         """The same for another level of detail."""
         return replace(self, level=level)
 
@@ -67,13 +67,13 @@ class Kept:
         return self.folder / f"{name}-{self.level}.npz"
 
 
-def identity(surface: Surface) -> str:
+def identity(surface: SurfaceFile) -> str:
     """A digest of a mesh: of its vertices with all that they have, and its triangles."""
     kinds = surface.rows.dtype, len(surface), surface.faces.dtype, len(surface.faces), surface.offset
     found = hashlib.sha256(" ".join(map(str, kinds)).encode())
     for rows in (surface.rows, surface.faces):
-        for at in range(0, len(rows), BLOCK):
-            found.update(np.ascontiguousarray(rows[at : at + BLOCK]))
+        for at in range(0, len(rows), BATCH_ROWS):
+            found.update(np.ascontiguousarray(rows[at : at + BATCH_ROWS]))
     return found.hexdigest()
 
 

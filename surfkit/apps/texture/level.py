@@ -13,26 +13,26 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
-from surfkit.apps.texture.candidates import NONE
+from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.exposure import exposed
-from surfkit.apps.texture.photographs import Photographs, by_photograph
-from surfkit.apps.texture.topology import NONE as NO_FACE
+from surfkit.apps.texture.photographs import PrefetchedPhotos, by_photograph
+from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
 
-SAMPLES = 5
+SAMPLES_PER_EDGE = 5
 """Along each edge of a seam."""
-SMOOTH = 0.3
+SMOOTHNESS_WEIGHT = 0.3
 """Weight of the change along an edge within a part, to that of the difference at a seam."""
-SMALL = 0.003
+VALUE_WEIGHT = 0.003
 """Weight of the values themselves: far from seams they go back to 0."""
-STEP = 0.1
+SEAM_ROBUST_SCALE = 0.1
 """Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
-MOST = 0.25
+MAX_CORRECTION = 0.25
 """Largest value that is added."""
 
 
 @dataclass(frozen=True)
-class Levels:
+class SeamCorrections:
     """Values to be added to colours in [0, 1].
 
     Attributes:
@@ -45,8 +45,13 @@ class Levels:
 
 
 def level(
-    faces: np.ndarray, view: np.ndarray, places: np.ndarray, beyond: np.ndarray, photos: Photographs, gains: np.ndarray
-) -> Levels:
+    faces: np.ndarray,
+    view: np.ndarray,
+    places: np.ndarray,
+    beyond: np.ndarray,
+    photos: PrefetchedPhotos,
+    gains: np.ndarray,
+) -> SeamCorrections:
     """Find the values.
 
     Args:
@@ -57,15 +62,17 @@ def level(
         photos: The photographs.
         gains: (V, 3) what their colours are multiplied by.
     """
-    seen = np.flatnonzero(view != NONE)
+    seen = np.flatnonzero(view != NO_PHOTO)
     count = len(gains)
     known, inverse = np.unique(faces[seen].astype(np.int64) * count + view[seen, None], return_inverse=True)
     corner = np.zeros(faces.shape, np.int64)
     corner[seen] = inverse.reshape(-1, 3)
     there = view[beyond]
-    face, edge = np.nonzero((beyond != NO_FACE) & (there != view[:, None]) & (there != NONE) & (view != NONE)[:, None])
+    face, edge = np.nonzero(
+        (beyond != NO_FACE) & (there != view[:, None]) & (there != NO_PHOTO) & (view != NO_PHOTO)[:, None]
+    )
     if not len(face):
-        return Levels(corner, np.zeros((len(known), 3), np.float32))
+        return SeamCorrections(corner, np.zeros((len(known), 3), np.float32))
     color = _seam_colors(corner, view, places, (face, edge), photos, gains, len(known))
     ends = np.stack([corner[face, edge], corner[face, (edge + 1) % 3]], axis=1)
     # the same two vertices, of the part beyond
@@ -74,7 +81,7 @@ def level(
     pairs = np.unique(np.sort(np.stack([ends.ravel(), other.ravel()], axis=1), axis=1), axis=0)
     inner = np.stack([corner[seen], np.roll(corner[seen], -1, axis=1)], axis=2).reshape(-1, 2)
     inner = np.unique(np.sort(inner, axis=1), axis=0)
-    return Levels(corner, _solved(pairs, inner, color, len(known)))
+    return SeamCorrections(corner, _solved(pairs, inner, color, len(known)))
 
 
 def _seam_colors(
@@ -82,7 +89,7 @@ def _seam_colors(
     view: np.ndarray,
     places: np.ndarray,
     seam: tuple[np.ndarray, np.ndarray],
-    photos: Photographs,
+    photos: PrefetchedPhotos,
     gains: np.ndarray,
     count: int,
 ) -> np.ndarray:
@@ -94,7 +101,7 @@ def _seam_colors(
     for done, (number, rows) in enumerate(parts, 1):
         picture, f, e = photos(number), face[rows], edge[rows]
         begin, end = places[f, e], places[f, (e + 1) % 3]
-        for share in (np.arange(SAMPLES) + 0.5) / SAMPLES:
+        for share in (np.arange(SAMPLES_PER_EDGE) + 0.5) / SAMPLES_PER_EDGE:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)
             x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
             shown = exposed(picture[:, y, x].T / 255, gains[number])
@@ -115,9 +122,9 @@ def _solved(pairs: np.ndarray, inner: np.ndarray, color: np.ndarray, count: int)
 
     one, other = pairs.T
     steps = color[other] - color[one]
-    weight = 1 / (1 + (np.abs(steps).max(1) / STEP) ** 2) ** 2
-    smooth = laplacian(inner, np.full(len(inner), SMOOTH))
-    matrix = (laplacian(pairs, weight) + smooth + SMALL * diags(np.ones(count))).tocsr()
+    weight = 1 / (1 + (np.abs(steps).max(1) / SEAM_ROBUST_SCALE) ** 2) ** 2
+    smooth = laplacian(inner, np.full(len(inner), SMOOTHNESS_WEIGHT))
+    matrix = (laplacian(pairs, weight) + smooth + VALUE_WEIGHT * diags(np.ones(count))).tocsr()
     scale = diags(1 / matrix.diagonal())
     found = np.zeros((count, 3), np.float32)
     for channel in range(3):
@@ -125,4 +132,4 @@ def _solved(pairs: np.ndarray, inner: np.ndarray, color: np.ndarray, count: int)
         side = np.bincount(one, step, count) - np.bincount(other, step, count)
         found[:, channel] = cg(matrix, side, rtol=1e-3, maxiter=500, M=scale)[0]
         emit(Progress("levelling seams", channel + 1, 3))
-    return found.clip(-MOST, MOST)
+    return found.clip(-MAX_CORRECTION, MAX_CORRECTION)

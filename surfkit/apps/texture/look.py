@@ -13,19 +13,19 @@ from surfkit.mesh.depths import nearest
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
-SLACK_PX = 2.0
+HIDDEN_SLACK_PX = 2.0
 """How far a triangle may lie behind the nearest surface and be seen, in sides of a pixel at its depth."""
-EDGE_PX, STEP_PX = 2, 12.0
+OUTLINE_PX, MIN_OUTLINE_STEP_PX = 2, 12.0
 """A triangle within so many pixels of the outline of something in front of it, by so many sides of a pixel, may show
 the colour of that: meshes and cameras are not exact."""
-AT_EDGE = 0.1
+EDGE_QUALITY = 0.1
 """What the quality of such a triangle is multiplied by."""
-AT_ONCE = 1 << 21
+BATCH_TRIANGLE_PIXELS = 1 << 21
 """Pairs of a triangle and a pixel in memory, without the compiled kernels."""
 
 
 @dataclass(frozen=True)
-class Sight:
+class TriangleVisibility:
     """The triangles that a photograph shows whole.
 
     Attributes:
@@ -51,7 +51,7 @@ def project(vertices: np.ndarray, camera: Camera) -> np.ndarray:
 
 def sight(
     mesh: Mesh, camera: Camera, photo: np.ndarray, keep: np.ndarray | None = None, longest: float = np.inf
-) -> Sight:
+) -> TriangleVisibility:
     """What a photograph shows of a mesh.
 
     Args:
@@ -66,17 +66,17 @@ def sight(
     if keep is not None:
         depth[~keep] = 0
     focal = min(camera.fx, camera.fy)
-    covered, hidden, sums = look(places, mesh.faces, photo, depth, SLACK_PX / focal)
+    covered, hidden, sums = look(places, mesh.faces, photo, depth, HIDDEN_SLACK_PX / focal)
     rows = np.flatnonzero((covered > 0) & (hidden == 0))
     rows = rows[np.ptp(places[mesh.faces[rows], :2], axis=1).max(1) <= longest]
     corners = places[mesh.faces[rows]]
-    near = ndimage.minimum_filter(depth, 2 * EDGE_PX + 1)
-    _, at_edge, _ = look(places, mesh.faces[rows], photo, near, STEP_PX / focal)
+    near = ndimage.minimum_filter(depth, 2 * OUTLINE_PX + 1)
+    _, at_edge, _ = look(places, mesh.faces[rows], photo, near, MIN_OUTLINE_STEP_PX / focal)
     (ax, ay), (bx, by) = (corners[:, i, :2].T - corners[:, 0, :2].T for i in (1, 2))
     area = np.abs(ax * by - ay * bx) / 2
-    quality = area * _cosine(mesh, camera, rows) * np.where(at_edge > 0, AT_EDGE, 1.0)
+    quality = area * _cosine(mesh, camera, rows) * np.where(at_edge > 0, EDGE_QUALITY, 1.0)
     color = np.rint(sums[rows] / covered[rows, None]).astype(np.uint8)
-    return Sight(rows, np.maximum(quality, 1e-6).astype(np.float32), color)
+    return TriangleVisibility(rows, np.maximum(quality, 1e-6).astype(np.float32), color)
 
 
 def _cosine(mesh: Mesh, camera: Camera, rows: np.ndarray) -> np.ndarray:
@@ -134,7 +134,9 @@ def look_in_numpy(
     ends = np.cumsum((high - low).prod(1))
     first = 0
     while first < len(rows):
-        last = max(first + 1, int(np.searchsorted(ends, (ends[first - 1] if first else 0) + AT_ONCE, "right")))
+        last = max(
+            first + 1, int(np.searchsorted(ends, (ends[first - 1] if first else 0) + BATCH_TRIANGLE_PIXELS, "right"))
+        )
         part = slice(first, last)
         _look_at_some(corners[rows[part]], rows[part], (low[part], high[part]), photo, depth, slack, into)
         first = last

@@ -11,17 +11,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from surfkit.apps.texture.candidates import NONE, Candidates
-from surfkit.apps.texture.charts import FULL, Atlas, make_atlas, texels_of
+from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
+from surfkit.apps.texture.charts import MAX_FILLED_SHARE, Atlas, make_atlas, texels_of
 from surfkit.apps.texture.choose import choose_views
-from surfkit.apps.texture.deliver import NAME, TILES, Delivery, Textured, deliver
+from surfkit.apps.texture.deliver import TEXTURED_NAME, TILES_FOLDER, TexturedMesh, TextureExport, deliver
 from surfkit.apps.texture.exposure import exposure_gains
-from surfkit.apps.texture.fill import Paint, Pictures
-from surfkit.apps.texture.keep import Arrays, Kept, identity, seen
-from surfkit.apps.texture.level import Levels, level
+from surfkit.apps.texture.fill import PaintInput, Pictures
+from surfkit.apps.texture.keep import Arrays, TextureCache, identity, seen
+from surfkit.apps.texture.level import SeamCorrections, level
 from surfkit.apps.texture.look import project, sight
-from surfkit.apps.texture.photographs import Photographs, by_photograph
-from surfkit.apps.texture.pieces import Pieces
+from surfkit.apps.texture.photographs import PrefetchedPhotos, by_photograph
+from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.regions import Region, divide, middles
 from surfkit.apps.texture.resolution import pixel_sizes
 from surfkit.apps.texture.topology import neighbours, with_short_edges
@@ -32,7 +32,7 @@ from surfkit.core.files import refuse_own, replacing_folder
 from surfkit.core.lock import locked
 from surfkit.core.stages import kept_parts, key_of
 from surfkit.core.version import own_version
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.io.splats.tileset import site_of
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.holes import areas_of
@@ -42,19 +42,20 @@ from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d"]
-RECORD = "texture.json"
+TEXTURE_RECORD = "texture.json"
 """What the textured mesh is; written last."""
-WORK = ".unfinished"
+UNFINISHED_SUFFIX = ".unfinished"
 """Ending of the name of the folder, beside the one that is written, for what is finished of it."""
-LOOKED, PAUSE_S, SHARE = "looked", 20.0, 30.0
-"""What was seen in the photographs so far is kept every `PAUSE_S` seconds, or `SHARE` times as long as that takes."""
-TEXELS = 6.0
+LOOKED_FOLDER, PAUSE_S, SAVE_PAUSE_FACTOR = "looked", 20.0, 30.0
+"""What was seen in the photographs so far is kept every `PAUSE_S` seconds, or `SAVE_PAUSE_FACTOR` times as long as that
+takes."""
+TEXELS_PER_TRIANGLE = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
-LONGEST_PX, LONGEST = 32.0, 4.0
+MAX_EDGE_TEXELS, MAX_EDGE_RATIO = 32.0, 4.0
 """Longer edges are halved: in texels, and in edges of a triangle of mean size; and those of a quarter of a page."""
-FINEST = 0.5
+MIN_TEXEL_PIXELS = 0.5
 """Of the median pixel on the surface: smaller texels would show nothing more."""
-LEAST = 100
+MIN_LEVEL_TRIANGLES = 100
 """Triangles of a level of detail."""
 
 
@@ -103,7 +104,7 @@ class TextureSettings:
 
 
 @dataclass(frozen=True)
-class Subject:
+class MeshWithPhotos:
     """What is textured, or drawn on maps.
 
     Attributes:
@@ -112,12 +113,12 @@ class Subject:
         views: The photographs to use.
     """
 
-    surface: Surface
+    surface: SurfaceFile
     frame: Frame
     views: Sequence[View] = ()
 
 
-def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_bytes: int) -> dict[str, Any]:
+def make_texture(subject: MeshWithPhotos, settings: TextureSettings, out: Path, budget_bytes: int) -> dict[str, Any]:
     """Write a textured mesh into a folder, and return what texture.json says: lengths are in units of the input.
 
     Args:
@@ -133,7 +134,7 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     """
     began = time.perf_counter()
     refuse_foreign(out)
-    work, frame = out.with_name(f"{out.name}{WORK}"), subject.frame
+    work, frame = out.with_name(f"{out.name}{UNFINISHED_SUFFIX}"), subject.frame
     if "tiles3d" in settings.formats:
         refuse_unplaced(frame, settings.geoid)
     key = key_of(
@@ -141,18 +142,18 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
         list(frame.shift), frame.to_input(np.eye(3)).tolist(),
     )  # fmt: skip
     with locked(work), kept_parts(work, key):
-        kept = Kept(work)
+        kept = TextureCache(work)
         made = textured(subject, settings, budget_bytes, kept)
         record = facts_of(made, subject)
         with replacing_folder(out) as folder:
-            how = Delivery(
+            how = TextureExport(
                 frame, subject.views, set(settings.formats), settings.pictures, settings.up, work, settings.geoid
             )
             more = coarser(subject, settings, budget_bytes, made, kept) if "tiles3d" in settings.formats else ()
             record["files"] = deliver(made, more, how, folder)
             record["seconds"] = round(time.perf_counter() - began, 1)
-            write_json(folder / RECORD, record)
-    for name in (*record["files"], RECORD):
+            write_json(folder / TEXTURE_RECORD, record)
+    for name in (*record["files"], TEXTURE_RECORD):
         emit(FileWritten(out / name, "textured mesh"))
     return record
 
@@ -165,10 +166,10 @@ def refuse_unplaced(frame: Frame, geoid: str | None) -> None:
         raise BadInput(f"{error}; or leave tiles3d out of --formats") from error
 
 
-def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
+def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
     """What texture.json says of a textured mesh."""
     mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
-    seen, areas = atlas.view != NONE, areas_of(mesh.vertices, mesh.faces)
+    seen, areas = atlas.view != NO_PHOTO, areas_of(mesh.vertices, mesh.faces)
     return {
         "mesh": str(subject.surface.path),
         "crs": subject.frame.crs,
@@ -188,13 +189,13 @@ def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
 
 
 def textured(
-    subject: Subject,
+    subject: MeshWithPhotos,
     settings: TextureSettings,
     budget_bytes: int,
-    kept: Kept = Kept(),
+    kept: TextureCache = TextureCache(),
     finer: Mesh | None = None,
     region: Region | None = None,
-) -> Textured:
+) -> TexturedMesh:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
     What is known already can be given: `finer`, the mesh simplified before, and `region`, the regions of the tiles.
@@ -208,7 +209,7 @@ def textured(
     texel, views = float(np.nanmedian(sizes)), subject.views
     if settings.texel != "auto":
         wanted = settings.texel / (frame.metres or 1.0)
-        if wanted < FINEST * texel:
+        if wanted < MIN_TEXEL_PIXELS * texel:
             emit(Warned(f"texels of {wanted:.3g} are finer than pixels, {texel:.3g} on the surface: these are taken"))
         else:
             texel, views = wanted, reduced(views, sizes, wanted)
@@ -218,7 +219,7 @@ def textured(
         return prepared(given, settings, texel * frame.scale)
 
     mesh = kept_mesh(kept, simplified)
-    photos = Photographs(views, budget_bytes)
+    photos = PrefetchedPhotos(views, budget_bytes)
     beyond, edge = neighbours(mesh.faces)
 
     def choose() -> Arrays:
@@ -227,17 +228,19 @@ def textured(
         return {"view": choose_views(found, beyond, edge), "gains": gains, "outliers": np.array([outliers])}
 
     chosen = kept.once("chosen", choose)
-    kept.forget(LOOKED)
-    if finer is None and (chosen["view"] == NONE).all():
+    kept.forget(LOOKED_FOLDER)
+    if finer is None and (chosen["view"] == NO_PHOTO).all():
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
     gains = chosen["gains"]
     levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))
-    return Textured(Paint(mesh, atlas, photos, gains, Levels(**levels)), region, texel, chosen["outliers"].item())
+    return TexturedMesh(
+        PaintInput(mesh, atlas, photos, gains, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
+    )
 
 
-def kept_mesh(kept: Kept, make: Callable[[], Mesh]) -> Mesh:
+def kept_mesh(kept: TextureCache, make: Callable[[], Mesh]) -> Mesh:
     """The mesh that `make` returns, or the one that was kept."""
 
     def arrays() -> Arrays:
@@ -248,14 +251,14 @@ def kept_mesh(kept: Kept, make: Callable[[], Mesh]) -> Mesh:
 
 
 def coarser(
-    subject: Subject, settings: TextureSettings, budget_bytes: int, fine: Textured, kept: Kept
-) -> Iterator[Textured]:
+    subject: MeshWithPhotos, settings: TextureSettings, budget_bytes: int, fine: TexturedMesh, kept: TextureCache
+) -> Iterator[TexturedMesh]:
     """Levels of detail: texels twice as large each, a quarter of the triangles, and regions of four tiles each."""
     mesh, depth, level = fine.paint.mesh, fine.region.depth, 0
     while depth > 0:
         depth, level = max(0, depth - 2), level + 1
         texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
-        fewer = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
+        fewer = max(MIN_LEVEL_TRIANGLES, len(fine.paint.mesh.faces) // 4**level)
         less = replace(settings, texel=texel, triangles=fewer)
         made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
         mesh = made.paint.mesh
@@ -268,15 +271,15 @@ def refuse_foreign(out: Path) -> None:
         raise OSError(errno.ENOTDIR, "a file; name a folder", str(out))
     refuse_own(out)
     names = {path.name for path in out.iterdir()} if out.exists() else set()
-    if names and RECORD not in names:
-        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
-    if other := sorted(name for name in names - {RECORD, TILES} if not name.startswith(NAME)):
+    if names and TEXTURE_RECORD not in names:
+        raise OSError(errno.ENOTEMPTY, f"not empty and without {TEXTURE_RECORD}; name another", str(out))
+    if other := sorted(name for name in names - {TEXTURE_RECORD, TILES_FOLDER} if not name.startswith(TEXTURED_NAME)):
         raise OSError(
             errno.ENOTEMPTY, f"has files that are not of a textured mesh: {few(other)}; name another", str(out)
         )
 
 
-def local_mesh(surface: Surface, frame: Frame) -> Mesh:
+def local_mesh(surface: SurfaceFile, frame: Frame) -> Mesh:
     """A mesh in the local frame."""
     vertices = np.empty((len(surface), 3), np.float32)
     for at in range(0, len(surface), 1 << 20):
@@ -309,22 +312,26 @@ def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View
 def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
     """The mesh with as many triangles as wanted, none of them too large; `texel` in local units."""
     area = float(areas_of(mesh.vertices, mesh.faces).sum())
-    wanted = settings.triangles if settings.triangles != "auto" else max(LEAST, int(area / texel**2 / TEXELS))
+    wanted = (
+        settings.triangles
+        if settings.triangles != "auto"
+        else max(MIN_LEVEL_TRIANGLES, int(area / texel**2 / TEXELS_PER_TRIANGLE))
+    )
     if wanted < len(mesh.faces):
         emit(Progress("simplifying", 0, 1))
         mesh = simplify_to(mesh, wanted)
         emit(Progress("simplifying", 1, 1))
     edge = (area / max(wanted, 1) * 4 / 3**0.5) ** 0.5
-    return with_short_edges(mesh, min(max(LONGEST_PX * texel, LONGEST * edge), settings.size / 4 * texel))
+    return with_short_edges(mesh, min(max(MAX_EDGE_TEXELS * texel, MAX_EDGE_RATIO * edge), settings.size / 4 * texel))
 
 
 def look_at_all(
-    mesh: Mesh, photos: Photographs, longest: float, kept: Kept = Kept()
+    mesh: Mesh, photos: PrefetchedPhotos, longest: float, kept: TextureCache = TextureCache()
 ) -> tuple[Candidates, np.ndarray, int]:
     """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
-    pieces, start = Pieces(mesh), 0
-    if (before := kept.read(LOOKED)) is not None:
+    pieces, start = MeshClusters(mesh), 0
+    if (before := kept.read(LOOKED_FOLDER)) is not None:
         start = int(before.pop("count"))
         vars(found).update(before)
     photos.expect(range(start, count))
@@ -341,8 +348,8 @@ def look_at_all(
             shown = sight(part, view.camera, picture, keep, longest)
             found.offer(number, replace(shown, faces=rows[shown.faces]))
         now = time.perf_counter()
-        if now - saved > max(PAUSE_S, SHARE * spent):
-            kept.write(LOOKED, {**vars(found), "count": np.array(number + 1)})
+        if now - saved > max(PAUSE_S, SAVE_PAUSE_FACTOR * spent):
+            kept.write(LOOKED_FOLDER, {**vars(found), "count": np.array(number + 1)})
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
@@ -369,5 +376,5 @@ def lay_out(
         corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3)
         places[rows] = project(corners, views[number].camera)[:, :2].reshape(-1, 3, 2)
     where = middles(mesh)
-    region = region or divide(where, texels_of(chosen, places), FULL * size**2)
+    region = region or divide(where, texels_of(chosen, places), MAX_FILLED_SHARE * size**2)
     return make_atlas(chosen, places, region.of(where), beyond, size), region

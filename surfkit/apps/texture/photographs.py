@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from surfkit.apps.texture.candidates import NONE
+from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import View
@@ -15,13 +15,13 @@ from surfkit.scene.scene import View
 def by_photograph(view: np.ndarray) -> list[tuple[int, np.ndarray]]:
     """Each photograph of (n,) numbers, and the rows that have it, rising; those of NONE are left out."""
     order = np.argsort(view, kind="stable")
-    order = order[view[order] != NONE]
+    order = order[view[order] != NO_PHOTO]
     numbers, starts = np.unique(view[order], return_index=True)
     parts = np.split(order, starts[1:])  # one, and not none, of no rows
     return list(zip(numbers.tolist(), parts[: len(numbers)], strict=True))
 
 
-class Photographs:
+class PrefetchedPhotos:
     """Photographs of views by number, read ahead in the order in which they are expected."""
 
     def __init__(self, views: Sequence[View], budget_bytes: int) -> None:

@@ -11,13 +11,13 @@ from surfkit.apps.texture.regions import divide, middles
 from surfkit.mesh.base import Mesh
 from surfkit.scene.camera import Camera
 
-PIECE = 1 << 14
+MAX_PIECE_TRIANGLES = 1 << 14
 """Triangles of a piece, at most."""
-BESIDE_PX = 1.0
+PIECE_MARGIN_PX = 1.0
 """Pieces within so much of the picture are taken: places in it are rounded."""
 
 
-class Pieces:
+class MeshClusters:
     """A mesh in pieces that lie close together.
 
     Args:
@@ -26,7 +26,7 @@ class Pieces:
 
     def __init__(self, mesh: Mesh) -> None:
         where = middles(mesh)
-        number = divide(where, np.ones(len(where)), PIECE).of(where)
+        number = divide(where, np.ones(len(where)), MAX_PIECE_TRIANGLES).of(where)
         order = np.argsort(number, kind="stable")
         starts = np.flatnonzero(np.diff(number[order], prepend=-1))
         corners = mesh.vertices[mesh.faces[order]]
@@ -40,8 +40,12 @@ class Pieces:
         """The pieces that may lie in a picture, as a mesh, and (n,) rows of its triangles in the whole one, rising."""
         pose = camera.world_to_camera.numpy()
         x, y, z = np.moveaxis(self.boxes @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3], 2, 0)
-        left, right = (camera.fx * x + (camera.cx + side) * z for side in (BESIDE_PX, -camera.width - BESIDE_PX))
-        top, bottom = (camera.fy * y + (camera.cy + side) * z for side in (BESIDE_PX, -camera.height - BESIDE_PX))
+        left, right = (
+            camera.fx * x + (camera.cx + side) * z for side in (PIECE_MARGIN_PX, -camera.width - PIECE_MARGIN_PX)
+        )
+        top, bottom = (
+            camera.fy * y + (camera.cy + side) * z for side in (PIECE_MARGIN_PX, -camera.height - PIECE_MARGIN_PX)
+        )
         outside = np.any([(side <= 0).all(1) for side in (z, left, -right, top, -bottom)], axis=0)
         if not outside.any():
             return self.mesh, np.arange(len(self.mesh.faces))

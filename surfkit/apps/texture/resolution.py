@@ -8,19 +8,19 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.scene.scene import Frame, View
 
-POINTS = 50_000
+SAMPLED_VERTICES = 50_000
 """Vertices that the depths are taken from."""
 
 
-def pixel_sizes(surface: Surface, views: Sequence[View], frame: Frame) -> np.ndarray:
+def pixel_sizes(surface: SurfaceFile, views: Sequence[View], frame: Frame) -> np.ndarray:
     """(V,) float64 side of a pixel of each view on the surface, units of the input; NaN where it shows none of it.
 
     That is the median depth of the vertices in the picture, whether hidden or not, divided by the focal length.
     """
-    step = max(1, len(surface) // POINTS)
+    step = max(1, len(surface) // SAMPLED_VERTICES)
     xyz = surface.vertices(slice(None, None, step))
     points = torch.from_numpy(frame.to_local(xyz[np.isfinite(xyz).all(1)]))
     sizes = np.full(len(views), np.nan)
@@ -33,7 +33,7 @@ def pixel_sizes(surface: Surface, views: Sequence[View], frame: Frame) -> np.nda
     return sizes
 
 
-def ground_sampling_distance(surface: Surface, views: Sequence[View], frame: Frame) -> float:
+def ground_sampling_distance(surface: SurfaceFile, views: Sequence[View], frame: Frame) -> float:
     """Side of a pixel on the surface, units of the input, rounded to two digits: the median over the views.
 
     Raises:

@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.texture.files import Part, write_textured_glb
-from surfkit.apps.texture.fill import Paint, Pictures
+from surfkit.apps.texture.files import AtlasPageMesh, write_textured_glb
+from surfkit.apps.texture.fill import PaintInput, Pictures
 from surfkit.apps.texture.regions import Region
 from surfkit.core.codec import write_json
 from surfkit.io.splats.gltf_reader import UPS
 from surfkit.io.splats.tileset import INDEX, box_json, ground_of, tileset
 from surfkit.scene.scene import Frame
 
-PIXELS = 16.0
+REFINE_ERROR_PX = 16.0
 """Geometric errors of as many pixels or more make viewers refine, by default: where a texel takes a pixel."""
 
 
-class Tiles:
+class TilesetWriter:
     """A tileset that is being written: a GLB file for each region of each level of detail, then tileset.json.
 
     Args:
@@ -43,7 +43,12 @@ class Tiles:
         self.count = 0
 
     def write(
-        self, regions: Sequence[Region], paint: Paint, parts: Sequence[Part], pages: Sequence[Path], texel: float
+        self,
+        regions: Sequence[Region],
+        paint: PaintInput,
+        parts: Sequence[AtlasPageMesh],
+        pages: Sequence[Path],
+        texel: float,
     ) -> None:
         """Write the tiles of a level, the finest first; regions that have a tile already keep it.
 
@@ -66,7 +71,7 @@ class Tiles:
             self.count += 1
             files = [parts[at] for at in mine], [pages[at] for at in mine]
             corners = write_textured_glb(self.folder / name, paint.mesh, *files, self.pictures, place, UPS["z"])
-            found = {"geometricError": PIXELS * texel * self.ground.unit, "content": {"uri": name}}
+            found = {"geometricError": REFINE_ERROR_PX * texel * self.ground.unit, "content": {"uri": name}}
             self.written[id(region)] = found, corners
 
     def finish(self, region: Region) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from surfkit.mesh.base import Mesh
 
-NONE = -1
-ROUNDS = 12
+NO_FACE = -1
+MAX_EDGE_HALVINGS = 12
 """Halvings of an edge at most."""
 
 
@@ -25,7 +25,7 @@ def neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     after = np.concatenate([same[1:], [False]])
     first = np.flatnonzero(same & ~before & ~after)  # of exactly two
     one, other = order[first], order[first + 1]
-    beyond, edge = np.full(len(order), NONE, np.int32), np.zeros(len(order), np.int8)
+    beyond, edge = np.full(len(order), NO_FACE, np.int32), np.zeros(len(order), np.int8)
     beyond[one], beyond[other] = other // 3, one // 3
     edge[one], edge[other] = other % 3, one % 3
     return beyond.reshape(-1, 3), edge.reshape(-1, 3)
@@ -37,14 +37,14 @@ def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
     Both triangles of an edge get its middle, so no cracks arise. A large triangle is hardly ever seen whole.
     """
     vertices, faces, colors = mesh.vertices, mesh.faces, mesh.colors
-    for _ in range(ROUNDS):
+    for _ in range(MAX_EDGE_HALVINGS):
         ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
         lengths = np.linalg.norm(vertices[ends[..., 0]] - vertices[ends[..., 1]], axis=2)
         long = lengths > longest
         if not long.any():
             break
         cut, number = np.unique(ends[long], axis=0, return_inverse=True)
-        middle = np.full(faces.shape, NONE, np.int64)
+        middle = np.full(faces.shape, NO_FACE, np.int64)
         middle[long] = len(vertices) + number.ravel()
         vertices = np.concatenate([vertices, vertices[cut].mean(1)]).astype(np.float32)
         if colors is not None:
@@ -55,12 +55,12 @@ def with_short_edges(mesh: Mesh, longest: float) -> Mesh:
 
 def _divided(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Triangles in 2, 3 or 4, by the middles of the edges that are cut; NONE for those that are not."""
-    cuts = (middle != NONE).sum(1)
+    cuts = (middle != NO_FACE).sum(1)
     parts = [faces[cuts == 0]]
     for count in (1, 2, 3):
         rows = np.flatnonzero(cuts == count)
         # turned so that the edge from a to b is cut, and, of two cuts, the one from b to c
-        there = middle[rows] != NONE
+        there = middle[rows] != NO_FACE
         first = there.argmax(1) if count != 2 else np.where(there[:, 0] & there[:, 2], 2, there.argmax(1))
         turn = (first[:, None] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(faces[rows], turn, 1).T

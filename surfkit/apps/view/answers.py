@@ -15,7 +15,7 @@ from surfkit.core.events import say
 SCRIPT = "/surfkit/script.js"
 ASK = "/surfkit/ask"
 """What the script asks first of all."""
-END = b"</body>"
+BODY_END = b"</body>"
 """The script is put before it."""
 
 Answer = Callable[[Mapping[str, str]], tuple[http.HTTPStatus, str]]
@@ -94,7 +94,7 @@ def with_script(body: bytes, encoding: str) -> bytes | None:
     if encoding not in ("identity", "gzip"):
         return None
     plain = gzip.decompress(body) if encoding == "gzip" else body
-    before, end, after = plain.rpartition(END)
+    before, end, after = plain.rpartition(BODY_END)
     if not end:
         return None
     page = b"".join([before, f'<script src="{SCRIPT[1:]}" defer></script>'.encode(), end, after])

@@ -10,26 +10,26 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.levels.tree import LodTree
-from surfkit.io.splats.table import COLUMNS, SplatTable
+from surfkit.io.splats.table import SPLAT_COLUMNS, SplatTable
 from surfkit.raster.api import CUTOFF
 from surfkit.scene.camera import Camera
 
-BESIDE = 1 / 16
+OUTSIDE_WEIGHT = 1 / 16
 """What lengths count beside the image in a lot, as a share: a camera that turns meets something there."""
-SPARE = 0.1
+OUTSIDE_BUDGET_SHARE = 0.1
 """Of the budget, for the coarsest levels of detail beside the image."""
-WIDER = 1.1
+VIEW_WIDENING = 1.1
 """By which the image is widened: what lies at its border is there when the camera turns a little."""
-SAMPLES = 32
+SAMPLES_PER_BLOCK = 32
 """Splats of a block that tell how many of them the camera sees."""
-SAFE = 0.98
+SAFE_BUDGET_SHARE = 0.98
 """Of the budget, where the samples have told too few."""
-CHUNK = 1 << 20
+PASS_SPLATS = 1 << 20
 """Splats that are looked at together, so that it takes little memory."""
 
 
 @dataclass(frozen=True)
-class Eye:
+class LodCamera:
     """A camera that chooses.
 
     Attributes:
@@ -40,10 +40,10 @@ class Eye:
     camera: Camera
     near: float
 
-    def widened(self) -> Eye:
-        """With a wider image, see `WIDER`."""
+    def widened(self) -> LodCamera:
+        """With a wider image, see `VIEW_WIDENING`."""
         camera = self.camera
-        return replace(self, camera=replace(camera, fx=camera.fx / WIDER, fy=camera.fy / WIDER))
+        return replace(self, camera=replace(camera, fx=camera.fx / VIEW_WIDENING, fy=camera.fy / VIEW_WIDENING))
 
     def sees(self, means: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
         """(N,) bool, whether a ball touches the image, and (N,) its distance, at least its radius.
@@ -64,7 +64,7 @@ class Eye:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class ChosenSplats:
     """Splats that stand for a model.
 
     Attributes:
@@ -79,7 +79,7 @@ class Chosen:
         return len(self.ids)
 
 
-class PointLot:
+class SampledPoints:
     """Points of a cloud, drawn by lot: the nearer to the camera, the more likely.
 
     Priority sampling (Duffield, Lund and Thorup, "Priority sampling for estimation of arbitrary subset sums", 2007):
@@ -96,7 +96,7 @@ class PointLot:
         self.reach = torch.zeros(count) if reach is None else reach
         self.luck = -torch.rand(count, generator=torch.Generator().manual_seed(0)).clamp_min(1e-12).log()
 
-    def rows(self, budget: int, eye: Eye | None = None) -> tuple[Tensor, Tensor]:
+    def rows(self, budget: int, eye: LodCamera | None = None) -> tuple[Tensor, Tensor]:
         """(n,) int64 rows in their order, of fewer than there are, for a camera or for no one in particular.
 
         Also (n,) by how much the logarithms of their weights are raised, so that they stand for those that are not
@@ -112,18 +112,20 @@ class PointLot:
             raised[beside[rows]] = 0  # so large, they would reach into the image
         return rows, raised
 
-    def _seen_by(self, eye: Eye) -> tuple[Tensor, Tensor]:
+    def _seen_by(self, eye: LodCamera) -> tuple[Tensor, Tensor]:
         """(N,) logarithms of weights, and (N,) bool, whether a point lies beside the image."""
         weights, beside = torch.empty(len(self.weights)), torch.empty(len(self.weights), dtype=torch.bool)
-        for first in range(0, len(weights), CHUNK):
-            part = slice(first, first + CHUNK)
+        for first in range(0, len(weights), PASS_SPLATS):
+            part = slice(first, first + PASS_SPLATS)
             inside, distance = eye.sees(self.means[part], self.reach[part])
-            weights[part] = self.weights[part] - 2 * distance.log() + torch.where(inside, 0.0, 2 * math.log(BESIDE))
+            weights[part] = (
+                self.weights[part] - 2 * distance.log() + torch.where(inside, 0.0, 2 * math.log(OUTSIDE_WEIGHT))
+            )
             beside[part] = ~inside
         return weights, beside
 
 
-class Lot(PointLot):
+class SampledSplats(SampledPoints):
     """Splats of a model without levels of detail: drawn by lot, and enlarged so that they stand for the others.
 
     The weight of a splat is its opacity times the area of its image; weights are raised by the area.
@@ -134,16 +136,16 @@ class Lot(PointLot):
         super().__init__(table.means, visibility(table), reach_of(table))
         self.table = of_degree_0(table)
 
-    def choose(self, budget: int, eye: Eye | None = None) -> Chosen:
+    def choose(self, budget: int, eye: LodCamera | None = None) -> ChosenSplats:
         """At most `budget` splats for a camera, or for no camera in particular."""
         if len(self.weights) <= budget:
-            return Chosen(np.arange(len(self.weights)), self.table)
+            return ChosenSplats(np.arange(len(self.weights)), self.table)
         rows, raised = self.rows(budget, eye)
         found = self.table.take(rows)
-        return Chosen(rows.numpy(), replace(found, log_scales=found.log_scales + raised[:, None] / 2))
+        return ChosenSplats(rows.numpy(), replace(found, log_scales=found.log_scales + raised[:, None] / 2))
 
 
-class Levels:
+class LodSplats:
     """Splats of levels of detail."""
 
     def __init__(self, tree: LodTree) -> None:
@@ -152,33 +154,33 @@ class Levels:
         self.tables = [of_degree_0(level.primitive.table(level.params)).on_cpu() for level in tree.levels]
         self.starts = np.concatenate([[0], np.cumsum([len(table) for table in self.tables])])
         self.sizes = blocks.last - blocks.first
-        steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
+        steps = (np.arange(SAMPLES_PER_BLOCK) + 0.5) / SAMPLES_PER_BLOCK
         rows = self.starts[blocks.level, None] + blocks.first[:, None] + (steps * self.sizes[:, None]).astype(np.int64)
         self.samples = self._take(np.minimum(rows, self.starts[-1] - 1).reshape(-1))
 
-    def choose(self, budget: int, eye: Eye) -> Chosen | None:
+    def choose(self, budget: int, eye: LodCamera) -> ChosenSplats | None:
         """At most `budget` splats for a camera; None if the coarsest ones that it sees are more."""
         eye = eye.widened()
         outside = self.blocks.outside(eye.camera, eye.near)
         errors = np.where(outside, 0.0, self.blocks.pixels(eye.camera))
         inside, _ = eye.sees(self.samples.means.float(), reach_of(self.samples))
-        share = inside.view(-1, SAMPLES).float().mean(1).clamp_min(0.5 / SAMPLES).numpy()
+        share = inside.view(-1, SAMPLES_PER_BLOCK).float().mean(1).clamp_min(0.5 / SAMPLES_PER_BLOCK).numpy()
         points = np.where(outside, 0.0, self.sizes * share)
-        most = allowed = budget - min(SPARE * budget, self.sizes[outside & self.blocks.is_leaf].sum())
+        most = allowed = budget - min(OUTSIDE_BUDGET_SHARE * budget, self.sizes[outside & self.blocks.is_leaf].sum())
         while allowed >= 1 and (front := self.blocks.front_within(errors, points, int(allowed))) is not None:
             ids = self._ids(front[~outside[front]])
             found = self._take(ids)
             kept = eye.sees(found.means.float(), reach_of(found))[0].numpy()
             if (count := int(kept.sum())) <= most:
                 return self._with_beside(ids[kept], front[outside[front]], budget - count)
-            allowed *= SAFE * most / count
+            allowed *= SAFE_BUDGET_SHARE * most / count
         return None
 
-    def _with_beside(self, ids: np.ndarray, beside: np.ndarray, room: int) -> Chosen:
+    def _with_beside(self, ids: np.ndarray, beside: np.ndarray, room: int) -> ChosenSplats:
         """Splats that are seen, and for so many more, blocks that are not: the coarsest first."""
         beside = beside[np.argsort(-self.blocks.level[beside], kind="stable")]
         ids = np.concatenate([ids, self._ids(beside[np.cumsum(self.sizes[beside]) <= room])])
-        return Chosen(ids, self._take(ids))
+        return ChosenSplats(ids, self._take(ids))
 
     def _ids(self, front: np.ndarray) -> np.ndarray:
         """(n,) rows of some blocks, counted through all levels."""
@@ -197,7 +199,9 @@ class Levels:
             for number in np.unique(level)
         ]
         back = torch.from_numpy(np.argsort(order, kind="stable"))
-        return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts])[back] for name in COLUMNS})
+        return replace(
+            parts[0], **{name: torch.cat([getattr(part, name) for part in parts])[back] for name in SPLAT_COLUMNS}
+        )
 
 
 def of_degree_0(table: SplatTable) -> SplatTable:

@@ -11,7 +11,7 @@ import tyro
 
 from surfkit.apps.view.page import show
 from surfkit.apps.view.server import LOCAL, Address, refuse_wrong_port, require_viser, served
-from surfkit.apps.view.shelf import MOST, Form
+from surfkit.apps.view.shelf import DEFAULT_BUDGET, Form
 from surfkit.apps.view.subject import opened_subject
 from surfkit.core.check import BadInput, printable
 from surfkit.io.splats.axes import AxesOrAuto
@@ -24,7 +24,7 @@ AWAKE_S = 0.2
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Look at a finished run, or at a file of splats, a mesh or points, in a browser on this machine.
 
     Splats, mesh, cameras with their photographs, blocks, depth, normals and errors; measuring in the units of the data
@@ -39,7 +39,7 @@ class View:
     out: Path | None = None
     """Folder for crop boxes and paths. Default: RUN/view, or FILE-view beside the file."""
 
-    most: int = MOST
+    most: int = DEFAULT_BUDGET
     """Splats, triangles and points that are sent to a browser at first; sliders on the page change it."""
 
     draw: Form | None = None
@@ -102,4 +102,4 @@ class View:
                     print("\nended")
 
 
-COMMAND = View
+COMMAND = ViewCommand

@@ -21,7 +21,7 @@ LOOK_S = 0.1
 
 
 @dataclass(frozen=True)
-class Drawing:
+class RenderedStep:
     """What was drawn between two steps.
 
     Attributes:
@@ -34,15 +34,15 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class Order:
+class RenderRequest:
     """A picture that a page waits for: of what, with the geometry or only colours."""
 
     view: View
     geometry: bool
-    made: Future[Drawing] = field(default_factory=Future)
+    made: Future[RenderedStep] = field(default_factory=Future)
 
 
-class Control:
+class TrainingControl:
     """Draws in the thread of the training what a page orders from another thread; one picture between two steps.
 
     While nobody orders anything, it costs a step some comparisons.
@@ -60,7 +60,7 @@ class Control:
         self.changed = threading.Condition()
         self.stage: Watched | None = None
         self.index, self.paused, self.spent = 0, False, 0.0
-        self.order: Order | None = None
+        self.order: RenderRequest | None = None
         self.psnrs: dict[Path, list[tuple[int, float]]] = defaultdict(list)
 
     def begin(self, stage: Watched) -> None:
@@ -91,14 +91,14 @@ class Control:
             self.paused = paused
             self.changed.notify_all()
 
-    def draw(self, view: View, geometry: bool) -> Drawing:
+    def draw(self, view: View, geometry: bool) -> RenderedStep:
         """Have a view drawn after the step that is being made, and wait for it. For the one thread that orders.
 
         Raises:
             BadInput: No stage runs in this process, or it ends before.
             Exception: What stopped the rasterizer, such as a lack of memory; the training goes on.
         """
-        order = Order(view, geometry)
+        order = RenderRequest(view, geometry)
         with self.changed:
             if self.stage is None:
                 raise BadInput("no step is being made now, so that nothing is drawn")
@@ -128,7 +128,7 @@ class Control:
             order.made.set_exception(BadInput("the run was stopped"))
             raise
         self.spent += time.perf_counter() - began
-        order.made.set_result(Drawing(maps, self.index))
+        order.made.set_result(RenderedStep(maps, self.index))
 
     def _wait(self) -> None:
         title = self.stage.title

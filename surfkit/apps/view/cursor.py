@@ -18,7 +18,7 @@ from surfkit.apps.view.answers import Script, client_in
 if TYPE_CHECKING:
     import viser
 
-WIDEST = 100.0
+MAX_ASPECT = 100.0
 """Of a window, widths by heights."""
 
 Say = Callable[[float, float], str]
@@ -86,7 +86,7 @@ def serve_cursors(script: Script, find: Callable[[int], Cursor | None], without:
         cursor = None if client is None else find(client)
         if cursor is None:
             return http.HTTPStatus.NOT_FOUND, "no such client"
-        x, y = (number(asked.get(name, ""), most) for name, most in (("x", WIDEST), ("y", 1.0)))
+        x, y = (number(asked.get(name, ""), most) for name, most in (("x", MAX_ASPECT), ("y", 1.0)))
         if x is None or y is None:
             return http.HTTPStatus.BAD_REQUEST, "x, y: numbers, within the window"
         return cursor.answer(x, y)

@@ -22,15 +22,15 @@ PALETTE = np.array(
     np.uint8,
 )
 """Of blocks, one after the other."""
-UNIT, LARGEST = 10.0, 255.0
+COVARIANCE_UNIT, MAX_COVARIANCE_SCALE = 10.0, 255.0
 """The unit of covariances, in typical standard deviations of splats; and the largest one in it, whose square is the
 largest number of 16 bits."""
-ENDS = (2, 98)
+HEIGHT_PERCENTILES = (2, 98)
 """Percentiles of the heights at the ends of the colours."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class BrowserSplats:
     """Splats for a browser.
 
     Attributes:
@@ -47,7 +47,7 @@ class Drawn:
     opacities: np.ndarray
     unit: float
 
-    def placed(self, places: np.ndarray, count: int) -> Drawn:
+    def placed(self, places: np.ndarray, count: int) -> BrowserSplats:
         """The same splats at (N,) places in a list of `count`, whose other places hold splats that are not seen."""
 
         def spread(values: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ class Drawn:
             return found
 
         parts = spread(self.means), spread(self.covariances), spread(self.rgb), spread(self.opacities)
-        return Drawn(*parts, self.unit)
+        return BrowserSplats(*parts, self.unit)
 
 
 def level_within(levels: LodTree, budget: int) -> int | None:
@@ -66,10 +66,10 @@ def level_within(levels: LodTree, budget: int) -> int | None:
 
 def unit_of(table: SplatTable) -> float:
     """The unit of covariances of a model, local units."""
-    return UNIT * max(table.median_scale(), 1e-12)
+    return COVARIANCE_UNIT * max(table.median_scale(), 1e-12)
 
 
-def drawn(table: SplatTable, rgb: np.ndarray | None = None, unit: float | None = None) -> Drawn:
+def drawn(table: SplatTable, rgb: np.ndarray | None = None, unit: float | None = None) -> BrowserSplats:
     """What a browser needs of splats of a local frame.
 
     Args:
@@ -79,9 +79,9 @@ def drawn(table: SplatTable, rgb: np.ndarray | None = None, unit: float | None =
     """
     unit = unit_of(table) if unit is None else unit
     scales = table.ellipsoid_log_scales().float().exp()
-    axes = axes_of(table.quats) * (scales / unit).clamp_max(LARGEST)[:, None, :]
+    axes = axes_of(table.quats) * (scales / unit).clamp_max(MAX_COVARIANCE_SCALE)[:, None, :]
     colors = (0.5 + SH_C0 * table.sh0.float()).clamp(0, 1).mul(255).round().byte().numpy() if rgb is None else rgb
-    return Drawn(
+    return BrowserSplats(
         table.means.float().numpy(),
         (axes @ axes.transpose(1, 2)).numpy(),
         colors,
@@ -117,7 +117,7 @@ def by_height(heights: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:
 
 def height_bounds(heights: np.ndarray) -> tuple[float, float]:
     """Of the ends of the colours."""
-    low, high = np.percentile(heights, ENDS)
+    low, high = np.percentile(heights, HEIGHT_PERCENTILES)
     return float(low), float(high)
 
 

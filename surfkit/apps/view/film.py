@@ -16,7 +16,7 @@ from surfkit.apps.render.path import from_file
 from surfkit.apps.render.video import Film, frames_of, make_video, require_video
 from surfkit.apps.view.plain import as_code, as_text
 from surfkit.apps.view.screen import telling
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.scene.camera import Camera
@@ -24,8 +24,8 @@ from surfkit.scene.camera import Camera
 if TYPE_CHECKING:
     import viser
 
-SIZES = ("1920x1080", "1280x720", "640x360")
-TELL_S = 0.5
+FILM_SIZES = ("1920x1080", "1280x720", "640x360")
+FILM_POLL_S = 0.5
 """Between two looks at how far it is."""
 
 
@@ -38,7 +38,7 @@ class FilmTool:
 
     def __init__(
         self,
-        shelf: Shelf,
+        shelf: SharedCache,
         client: viser.ClientHandle,
         folder: Any,
         save: Callable[[], Path],
@@ -57,7 +57,7 @@ class FilmTool:
         self.stopping, self.running, self.told_at = threading.Event(), False, 0.0
         gui = client.gui
         with folder:
-            self.size = gui.add_dropdown("size", SIZES)
+            self.size = gui.add_dropdown("size", FILM_SIZES)
             self.show = gui.add_dropdown("of", get_args(Show))
             self.button = gui.add_button("make the video")
             self.bar = gui.add_progress_bar(0.0, visible=False)
@@ -121,6 +121,6 @@ class FilmTool:
         if self.stopping.is_set() or self.closing.is_set():
             raise Stopped
         now = time.monotonic()
-        if now >= self.told_at + TELL_S or done == total:
+        if now >= self.told_at + FILM_POLL_S or done == total:
             self.told_at = now
             self.bar.value, self.told.content = 100 * done / total, f"{what}: {done:,} of {total:,}"

@@ -20,7 +20,7 @@ SPEED_OVER = 20
 
 
 @dataclass
-class History:
+class StageHistory:
     """A stage as its journal tells it, up to now.
 
     Attributes:
@@ -76,13 +76,13 @@ class History:
         return {"step": thin["all"][0], **{name: values for name, (_, values) in thin.items()}}
 
 
-class Follower:
+class JournalFollower:
     """Reads what a journal got since it was last read, and all of it if steps were taken back."""
 
     def __init__(self, folder: Path) -> None:
         """Nothing is read yet."""
-        self.path = folder / journal.NAME
-        self.history = History()
+        self.path = folder / journal.JOURNAL_FILE
+        self.history = StageHistory()
         self.file, self.at = None, 0
 
     def read(self) -> bool:
@@ -91,7 +91,7 @@ class Follower:
             with self.path.open("rb") as file:
                 about = os.fstat(file.fileno())
                 if about.st_ino != self.file or about.st_size < self.at:
-                    self.history, self.file, self.at = History(), about.st_ino, 0
+                    self.history, self.file, self.at = StageHistory(), about.st_ino, 0
                 file.seek(self.at)
                 fresh = file.read()
         except OSError:  # it is being replaced, or the file system is away
@@ -112,7 +112,7 @@ def journals(out: Path) -> dict[str, Path]:
     times = {}
     for folder in found:
         try:
-            times[folder] = (folder / journal.NAME).stat().st_mtime
+            times[folder] = (folder / journal.JOURNAL_FILE).stat().st_mtime
         except OSError:
             continue
     return {_name(out, folder): folder for folder in sorted(times, key=times.__getitem__)}

@@ -13,7 +13,7 @@ COOKIE = "surfkit-view"
 
 
 @dataclass(frozen=True)
-class Asked:
+class AuthRequest:
     """What the gate looks at in a request, of a page, a file or a websocket alike.
 
     Attributes:
@@ -30,7 +30,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Gate:
+class TokenAuth:
     """Lets a request through that brings the token, in the query of the address or in the cookie that it is then given.
 
     Attributes:
@@ -46,11 +46,11 @@ class Gate:
         """The Set-Cookie header that replaces the token in the address: for no script and no other site."""
         return f"{COOKIE}-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Lax"
 
-    def brings_token(self, asked: Asked) -> bool:
+    def brings_token(self, asked: AuthRequest) -> bool:
         """Whether the token is in the query."""
         return any(self._is_token(value) for value in parse_qs(urlsplit(asked.target).query).get("token", ()))
 
-    def admits(self, asked: Asked) -> bool:
+    def admits(self, asked: AuthRequest) -> bool:
         """Whether the request may be answered."""
         if any(urlsplit(origin).netloc not in asked.hosts for origin in asked.origins):
             return False  # a page of another server, or of another port of this host

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from surfkit.apps.render.path import MOST_FRAMES, OPENGL, through
+from surfkit.apps.render.path import MAX_FRAMES, OPENGL, through
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
-HEIGHT = 1080
+KEYFRAME_HEIGHT_PX = 1080
 """Of the pictures that the file suggests, pixels; `surfkit render --size` has the last word."""
 
 
@@ -46,12 +46,13 @@ class KeyPath:
         if len(self.poses) < 2:
             raise BadInput("a path needs at least two key views: add one, move the camera, and add another")
         frames = max(2, round(self.seconds * self.fps))
-        if frames > MOST_FRAMES:
-            raise BadInput(f"{frames} frames are too many for a path: {MOST_FRAMES} at most; give fewer seconds")
-        focal = HEIGHT / (2 * math.tan(math.radians(self.fov_degrees) / 2))
-        width = HEIGHT * 16 // 9
+        if frames > MAX_FRAMES:
+            raise BadInput(f"{frames} frames are too many for a path: {MAX_FRAMES} at most; give fewer seconds")
+        focal = KEYFRAME_HEIGHT_PX / (2 * math.tan(math.radians(self.fov_degrees) / 2))
+        width = KEYFRAME_HEIGHT_PX * 16 // 9
         keys = [
-            Camera(torch.from_numpy(pose), focal, focal, width / 2, HEIGHT / 2, width, HEIGHT) for pose in self.poses
+            Camera(torch.from_numpy(pose), focal, focal, width / 2, KEYFRAME_HEIGHT_PX / 2, width, KEYFRAME_HEIGHT_PX)
+            for pose in self.poses
         ]
         return through(keys, keys[0], frames).cameras
 
@@ -70,7 +71,7 @@ def write_path(path: Path, keys: KeyPath, frame: Frame) -> int:
         rows.append(
             {"camera_to_world": pose.ravel().tolist(), "fov": keys.fov_degrees, "aspect": camera.width / camera.height}
         )
-    lens = {"render_height": HEIGHT, "render_width": HEIGHT * 16 // 9}
+    lens = {"render_height": KEYFRAME_HEIGHT_PX, "render_width": KEYFRAME_HEIGHT_PX * 16 // 9}
     content = {"camera_type": "perspective", **lens, "fps": keys.fps, "seconds": keys.seconds, "camera_path": rows}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)

@@ -9,27 +9,27 @@ import numpy as np
 from surfkit.apps.view.display import PALETTE
 from surfkit.apps.view.mesh_layer import MeshLayer
 from surfkit.apps.view.outlines import block_outlines
-from surfkit.apps.view.pace import Pace
+from surfkit.apps.view.pace import DrawPace
 from surfkit.apps.view.picking import corners_of
 from surfkit.apps.view.plain import as_text
 from surfkit.apps.view.point_layer import PointLayer
-from surfkit.apps.view.screen import WORLD, Following, Latest, telling
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.screen import WORLD, CameraFollower, Debouncer, telling
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.apps.view.splat_layer import SplatLayer
 
 if TYPE_CHECKING:
     import viser
 
-TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
+TRAINED_COLOR, HELD_OUT_COLOR = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
-MOST_LABELS = 400
+MAX_LABELLED_BLOCKS = 400
 """Blocks that get a label."""
 
 
 class Layers:
     """What is drawn in one browser, and its switches."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace) -> None:
         """Build the switches, and draw."""
         self.shelf, self.client, self.subject = shelf, client, shelf.subject
         centres = [view.camera.centre.numpy() for view in self.subject.views]
@@ -52,7 +52,7 @@ class Layers:
             if self.subject.plan is not None:
                 shown = gui.add_checkbox("blocks", False)
                 shown.on_update(telling(client, lambda _: self._blocks(shown.value)))
-        self.following = Following(self._camera, pace.rest)
+        self.following = CameraFollower(self._camera, pace.rest)
         pace.follow = self._follow
         client.camera.on_update(self.following.moved)
         self.following.moved()  # it may have, while the first splats were chosen
@@ -90,7 +90,7 @@ class Layers:
                 return
             centres, corners = corners_of([view.camera for view in self.subject.views], self.camera_size)
             held = np.arange(len(centres)) >= len(self.subject.scene.train)  # type: ignore[union-attr]
-            colors = np.where(held[:, None], HELD_OUT, TRAINED).astype(np.uint8)
+            colors = np.where(held[:, None], HELD_OUT_COLOR, TRAINED_COLOR).astype(np.uint8)
             self.client.scene.add_line_segments(
                 "/cameras",
                 frustum_lines(centres, corners) * WORLD,
@@ -101,7 +101,7 @@ class Layers:
 
         draw()
         shown.on_update(telling(self.client, lambda _: draw()))
-        size.on_update(telling(self.client, Latest(draw)))
+        size.on_update(telling(self.client, Debouncer(draw)))
 
     def _blocks(self, shown: bool) -> None:
         scene = self.client.scene
@@ -114,7 +114,7 @@ class Layers:
         colors = np.broadcast_to(PALETTE[owner % len(PALETTE)][:, None], (len(owner), 2, 3))
         scene.add_frame("/blocks", show_axes=False)
         scene.add_line_segments("/blocks/lines", segments * WORLD, colors, thickness=2.5, thickness_units="screen")
-        for block, place in zip(plan.blocks[:MOST_LABELS], places, strict=False):
+        for block, place in zip(plan.blocks[:MAX_LABELLED_BLOCKS], places, strict=False):
             text = f"block {block.index}: {len(block.views)} views"
             scene.add_label(f"/blocks/{block.index}", text, position=place * WORLD, anchor="bottom-center")
 

@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from surfkit.apps.view.control import Control
+from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.cursor import Cursor, serve_cursors
-from surfkit.apps.view.live_page import WITHOUT, LivePage, Surroundings
+from surfkit.apps.view.live_page import NO_COORDINATES_NOTE, LivePage, SceneWithoutModel
 from surfkit.apps.view.live_panel import LivePanel
 from surfkit.apps.view.screen import WORLD
-from surfkit.apps.view.server import Address, Served, served
+from surfkit.apps.view.server import Address, RunningServer, served
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.train.watch import Watched, watched_by
@@ -31,12 +31,12 @@ from surfkit.train.watch import Watched, watched_by
 if TYPE_CHECKING:
     import viser
 
-WHAT = "surfkit train --view"
-TELL_S = 1.0
+LIVE_COMMAND = "surfkit train --view"
+JOURNAL_POLL_S = 1.0
 """Between two looks at the journals, while somebody looks at the page."""
-CHECK_S = 0.1
+PICTURE_POLL_S = 0.1
 """Between two looks whether a picture is due, while somebody looks at the page."""
-CLOSE_S = 2.0
+THREAD_CLOSE_S = 2.0
 """For a thread to end."""
 
 
@@ -48,17 +48,17 @@ class Live:
         control: Draws, and holds the training.
     """
 
-    def __init__(self, page: Served, share: float) -> None:
+    def __init__(self, page: RunningServer, share: float) -> None:
         """Serve; at most a `share` of the time of the training goes into pictures."""
         self.page, self.share, self.url = page, share, page.url
-        self.control = Control()
+        self.control = TrainingControl()
         self.out: Path | None = None
-        self.around: Surroundings | None = None
+        self.around: SceneWithoutModel | None = None
         self.pages: dict[int, LivePage] = {}
         self.wake = threading.Event()
         self.failed: set[str] = set()
         self.panel = LivePanel(page.viser.gui, self.control)
-        serve_cursors(page.script, self._cursor_of, WITHOUT)
+        serve_cursors(page.script, self._cursor_of, NO_COORDINATES_NOTE)
         page.viser.on_client_connect(self._connected)
         page.viser.on_client_disconnect(lambda client: self.pages.pop(client.client_id, None))
         actions = {"pictures": self._draw_pictures, "panel": self._tell}
@@ -78,7 +78,7 @@ class Live:
         self.page.closing.set()
         self.wake.set()
         for thread in self.threads:
-            thread.join(CLOSE_S)
+            thread.join(THREAD_CLOSE_S)
 
     def _cursor_of(self, client_id: int) -> Cursor | None:
         return page.cursor if (page := self.pages.get(client_id)) is not None else None
@@ -104,13 +104,13 @@ class Live:
                 took = self.control.spent - spent + time.perf_counter() - page.received  # not the wait for the step
                 free = time.monotonic() + rest(took, self.share)
                 continue
-            self.wake.wait(CHECK_S if pages else None)
+            self.wake.wait(PICTURE_POLL_S if pages else None)
             self.wake.clear()
 
     def _enter(self, stage: Watched) -> None:
         """Show the scene of a stage, if it is another than before."""
         if self.around is None or self.around.scene is not stage.scene:
-            around = Surroundings(stage.scene)
+            around = SceneWithoutModel(stage.scene)
             up, at, middle = around.first
             server = self.page.viser
             server.scene.set_up_direction(up)
@@ -122,7 +122,7 @@ class Live:
                 page.enter(self.around)
 
     def _tell(self) -> None:
-        while not self.page.closing.wait(TELL_S):
+        while not self.page.closing.wait(JOURNAL_POLL_S):
             if self.pages:
                 self._carefully("panel", partial(self.panel.show, self.out), partial(self.panel.tell_failed, "panel"))
 
@@ -137,7 +137,7 @@ class Live:
             said = " ".join(f"{type(error).__name__}: {error}".split())
             if what not in self.failed:
                 self.failed.add(what)
-                say(f"surfkit: {WHAT}: {what}: {said}; the training goes on")
+                say(f"surfkit: {LIVE_COMMAND}: {what}: {said}; the training goes on")
         tell(said)
 
 
@@ -157,7 +157,7 @@ def live_view(address: Address, share: float) -> Iterator[Live]:
     Raises:
         BadInput: viser is not installed, the port is taken, or the host is none of this machine.
     """
-    with served(address, "surfkit train", WHAT) as page:
+    with served(address, "surfkit train", LIVE_COMMAND) as page:
         live = Live(page, share)
         try:
             yield live

@@ -14,12 +14,12 @@ import torch
 
 from surfkit.apps.render.frames import view_of
 from surfkit.apps.render.path import beside, middle_of, up_of
-from surfkit.apps.view.control import Control
+from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.cursor import Cursor
-from surfkit.apps.view.layers import TRAINED, frustum_lines, typical_size
+from surfkit.apps.view.layers import TRAINED_COLOR, frustum_lines, typical_size
 from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.on_page import OnPage, framed, window_of
-from surfkit.apps.view.photographs import TURNING
+from surfkit.apps.view.on_page import FramedPictures, framed, window_of
+from surfkit.apps.view.photographs import TURNING_DISTANCE
 from surfkit.apps.view.picking import corners_of, hit_camera, surface_depth
 from surfkit.apps.view.pictures import picture
 from surfkit.apps.view.plain import as_text
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
 
 Kind = Literal["render", "depth", "normal"]
 Place = Literal["where I am", "a training camera"]
-HERE, THERE = get_args(Place)
-LEAST, MOST, USUAL, STEP = 160, 1600, 640, 80
+FREE_PLACE, CAMERA_PLACE = get_args(Place)
+MIN_PICTURE_PX, MAX_PICTURE_PX, DEFAULT_PICTURE_PX, PICTURE_STEP_PX = 160, 1600, 640, 80
 """Of the longer side of a picture, pixels."""
 REFRESH_S = 2.0
 """Between two pictures from the same place: only the training has changed them."""
 JPEG_QUALITY = 85
-WITHOUT = "no coordinates are shown"
+NO_COORDINATES_NOTE = "no coordinates are shown"
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class SceneWithoutModel:
     """A scene to look at, before there is a model of it."""
 
     scene: Scene
@@ -87,7 +87,9 @@ class LivePage:
         shown: The picture, if its depths are known.
     """
 
-    def __init__(self, control: Control, client: viser.ClientHandle, wake: threading.Event, script: bool) -> None:
+    def __init__(
+        self, control: TrainingControl, client: viser.ClientHandle, wake: threading.Event, script: bool
+    ) -> None:
         """Build the panel.
 
         Args:
@@ -97,8 +99,8 @@ class LivePage:
             script: Whether the page can tell where the pointer is.
         """
         self.control, self.client, self.wake = control, client, wake
-        self.shown: OnPage | None = None
-        self.around: Surroundings | None = None
+        self.shown: FramedPictures | None = None
+        self.around: SceneWithoutModel | None = None
         self.dirty, self.index, self.drawn, self.received = True, -1, 0.0, 0.0
         self.photo: tuple[tuple[str, int], np.ndarray] | None = None
         gui = client.gui
@@ -109,7 +111,7 @@ class LivePage:
             self.number = gui.add_number("camera", 1, min=1, max=1, step=1)
             step = gui.add_button_group("go to", ("previous", "next", "stand there"))
             self.cameras = gui.add_checkbox("cameras", False, hint="Click on one to see it beside its photograph.")
-            self.longest = gui.add_slider("pixels", LEAST, MOST, STEP, USUAL)
+            self.longest = gui.add_slider("pixels", MIN_PICTURE_PX, MAX_PICTURE_PX, PICTURE_STEP_PX, DEFAULT_PICTURE_PX)
             self.told = gui.add_markdown("")
         self.cursor = Cursor(client, folder, self._under) if script else None
         if self.cursor is not None:
@@ -122,7 +124,7 @@ class LivePage:
         client.camera.on_update(self._moved)
         client.scene.on_click()(telling(client, self._click))
 
-    def enter(self, around: Surroundings) -> None:
+    def enter(self, around: SceneWithoutModel) -> None:
         """Show another scene; the first one is looked at from where all of it is seen."""
         first, self.around, self.photo, self.shown = self.around is None, around, None, None
         self.number.max = len(around.views)
@@ -159,7 +161,7 @@ class LivePage:
 
     def _draw(self) -> None:
         around, kind = self.around, self.kind.value
-        chosen = self._chosen if self.place.value == THERE else None
+        chosen = self._chosen if self.place.value == CAMERA_PLACE else None
         camera = self._camera() if chosen is None else chosen.camera.fitted(int(self.longest.value))
         view = replace(chosen, camera=camera) if chosen is not None else view_of(camera)
         following = self.cursor is not None and self.cursor.on.value
@@ -175,7 +177,7 @@ class LivePage:
         depth = surface_depth(drawing.maps) if following else None
         self.client.scene.set_background_image(framed(images, window), format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.index = drawing.index
-        self.shown = None if depth is None else OnPage(view.camera, depth.numpy(), len(images), window)
+        self.shown = None if depth is None else FramedPictures(view.camera, depth.numpy(), len(images), window)
         self.told.content = f"After step {drawing.index:,}: {told}"
         if self.cursor is not None:
             self.cursor.changed()
@@ -220,12 +222,12 @@ class LivePage:
         self.wake.set()
 
     def _moved(self, _camera: Any) -> None:
-        if self.place.value == HERE:
+        if self.place.value == FREE_PLACE:
             self._ask()
 
     def _numbered(self, event: Any) -> None:
         if event.client is not None:
-            self.place.value = THERE
+            self.place.value = CAMERA_PLACE
             self._changed()
 
     def _step(self, word: str) -> None:
@@ -233,29 +235,31 @@ class LivePage:
             raise BadInput("there is no camera yet: the data set is not read")
         if word == "stand there":
             camera = self._chosen.camera
-            stand_at(self.client, camera.world_to_camera.numpy(), TURNING)
+            stand_at(self.client, camera.world_to_camera.numpy(), TURNING_DISTANCE)
             self.client.camera.fov = whole_view(camera, self.client.camera.aspect)
-            self.place.value = HERE
+            self.place.value = FREE_PLACE
         else:
             self.number.value = (int(self.number.value) - 1 + (1 if word == "next" else -1)) % len(
                 self.around.views
             ) + 1
-            self.place.value = THERE
+            self.place.value = CAMERA_PLACE
         self._changed()
 
     def _click(self, event: viser.SceneClickEvent) -> None:
-        if self.around is None or not self.cameras.value or self.place.value == THERE:
+        if self.around is None or not self.cameras.value or self.place.value == CAMERA_PLACE:
             return
         _, corners = corners_of([view.camera for view in self.around.views], self.around.size)
         met = hit_camera(corners, *ray_of(event))
         if met is not None:
-            self.number.value, self.place.value = met + 1, THERE
+            self.number.value, self.place.value = met + 1, CAMERA_PLACE
             self._changed()
 
     def _draw_cameras(self) -> None:
         """Outlines of the cameras, over the picture from where one stands."""
-        if self.around is None or not self.cameras.value or self.place.value == THERE:
+        if self.around is None or not self.cameras.value or self.place.value == CAMERA_PLACE:
             self.client.scene.remove_by_name("/cameras")
             return
         lines = frustum_lines(*corners_of([view.camera for view in self.around.views], self.around.size))
-        self.client.scene.add_line_segments("/cameras", lines * WORLD, TRAINED, thickness=1.5, thickness_units="screen")
+        self.client.scene.add_line_segments(
+            "/cameras", lines * WORLD, TRAINED_COLOR, thickness=1.5, thickness_units="screen"
+        )

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from surfkit.apps.view.control import Control
-from surfkit.apps.view.follow import Follower, History, journals, newest_pictures, running_blocks
+from surfkit.apps.view.control import TrainingControl
+from surfkit.apps.view.follow import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
 from surfkit.apps.view.plain import as_text
 from surfkit.runs.execute.state import BlockState
 from surfkit.train.watch import Watched
@@ -20,26 +20,37 @@ if TYPE_CHECKING:
     import viser
 
 NEWEST = "what runs now"
-COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+STROKE_COLORS = (
+    "#1f77b4",
+    "#ff7f0e",
+    "#2ca02c",
+    "#d62728",
+    "#9467bd",
+    "#8c564b",
+    "#e377c2",
+    "#7f7f7f",
+    "#bcbd22",
+    "#17becf",
+)
 CHART_PX = 160
 """Height of a chart."""
 PICTURE_PX = 1200
 """Width of a picture that the run has written."""
 ELSEWHERE = "Other processes train these blocks: here are their losses, but no live picture, and no pause."
 PAUSED = "\n\n**Paused.**"
-ALONE = "The method makes these steps on its own: here are its losses, but no live picture, and no pause."
+OPAQUE_METHOD = "The method makes these steps on its own: here are its losses, but no live picture, and no pause."
 FRESH_S = 30.0
 """Since the last step of a method that still makes some."""
-NOTHING = "No step is made at the moment, so that there is no live picture, and nothing to pause."
+NO_STEPS = "No step is made at the moment, so that there is no live picture, and nothing to pause."
 
 
 class LivePanel:
     """Parts of the panel that are the same in every browser."""
 
-    def __init__(self, gui: viser.GuiApi, control: Control) -> None:
+    def __init__(self, gui: viser.GuiApi, control: TrainingControl) -> None:
         """Build them."""
         self.gui, self.control = gui, control
-        self.followers: dict[Path, Follower] = {}
+        self.followers: dict[Path, JournalFollower] = {}
         self.drawn: Path | None = None
         self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
         self.picture_path: Path | None = None
@@ -70,7 +81,7 @@ class LivePanel:
         here = f"block {min(running)}" if running else last  # of many that run, the same one all the time
         now = stage.folder if stage is not None else found.get(here, out)
         chosen = found.get(self.of.value, now)
-        self.followers = {folder: self.followers.get(folder) or Follower(folder) for folder in (now, chosen)}
+        self.followers = {folder: self.followers.get(folder) or JournalFollower(folder) for folder in (now, chosen)}
         fresh = {folder for folder, follower in self.followers.items() if follower.read()}
         if (chosen in fresh or chosen != self.drawn) and self.followers[chosen].history.rows:
             self._draw_curves(chosen)
@@ -106,7 +117,7 @@ class LivePanel:
             return
         if chart is not None:
             chart.remove()
-        strokes = itertools.cycle(COLORS)
+        strokes = itertools.cycle(STROKE_COLORS)
         series = ({"label": "step"}, *({"label": name, "stroke": next(strokes), "width": 2} for name in names))
         with self.curves:
             chart = self.gui.add_uplot(
@@ -136,7 +147,9 @@ class LivePanel:
         set_if_other(self.button, "label", "go on" if self.control.paused else "pause")
 
 
-def in_words(history: History, stage: Watched | None, running: dict[int, BlockState], control: Control) -> str:
+def in_words(
+    history: StageHistory, stage: Watched | None, running: dict[int, BlockState], control: TrainingControl
+) -> str:
     """How far a run is, in Markdown."""
     if stage is not None:
         return f"**{as_text(stage.title)}** {numbers(history)}{PAUSED if control.paused else ''}"
@@ -144,12 +157,12 @@ def in_words(history: History, stage: Watched | None, running: dict[int, BlockSt
         rows = [f"- block {at}: step {state.step:,} of {state.steps:,}" for at, state in running.items()]
         return "\n".join([f"{ELSEWHERE}\n", *rows])
     if history.times and history.index < history.steps and time.time() - history.times[-1] < FRESH_S:
-        return f"**{as_text(history.title)}** {numbers(history)}\n\n{ALONE}"
+        return f"**{as_text(history.title)}** {numbers(history)}\n\n{OPAQUE_METHOD}"
     last = f"\n\n**{as_text(history.title)}** {numbers(history)}" if history.rows else ""
-    return NOTHING + last
+    return NO_STEPS + last
 
 
-def numbers(history: History) -> str:
+def numbers(history: StageHistory) -> str:
     """Step, points, speed and loss."""
     if not history.rows:
         return "begins"

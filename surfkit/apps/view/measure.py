@@ -13,7 +13,7 @@ from surfkit.scene.up_direction import map_axes
 
 
 @dataclass(frozen=True)
-class Measured:
+class PolylineMeasure:
     """Of K points in the order of clicking, units of the input or metres.
 
     Attributes:
@@ -32,7 +32,7 @@ class Measured:
     plan: float
 
 
-def measured(points: np.ndarray, up: np.ndarray, unit: float = 1.0) -> Measured:
+def measured(points: np.ndarray, up: np.ndarray, unit: float = 1.0) -> PolylineMeasure:
     """What (K, 3) points enclose.
 
     Args:
@@ -42,12 +42,12 @@ def measured(points: np.ndarray, up: np.ndarray, unit: float = 1.0) -> Measured:
     """
     points = np.asarray(points, np.float64).reshape(-1, 3) * unit
     if not len(points):
-        return Measured(0.0, 0.0, 0.0, 0.0, 0.0)
+        return PolylineMeasure(0.0, 0.0, 0.0, 0.0, 0.0)
     points = points - points[0]  # coordinates of millions of metres would lose digits in products
     steps = np.diff(points, axis=0)
     level = steps - np.outer(steps @ up, up)
     vector = np.cross(points, np.roll(points, -1, axis=0)).sum(0) / 2
-    return Measured(
+    return PolylineMeasure(
         length=float(np.linalg.norm(steps, axis=1).sum()),
         level=float(np.linalg.norm(level, axis=1).sum()),
         rise=float(points[-1] @ up),
@@ -56,7 +56,7 @@ def measured(points: np.ndarray, up: np.ndarray, unit: float = 1.0) -> Measured:
     )
 
 
-def in_words(found: Measured, frame: Frame, count: int) -> str:
+def in_words(found: PolylineMeasure, frame: Frame, count: int) -> str:
     """A table in Markdown of what `count` points measure; the lengths are in metres if the frame has some."""
     name = "m" if frame.metres else "units"
     if count < 2:

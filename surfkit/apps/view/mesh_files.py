@@ -11,25 +11,25 @@ import numpy as np
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.evaluate.geometry.place import Place, place_of, root_of
-from surfkit.evaluate.geometry.surface import Surface, read_surface
-from surfkit.io.glb import BYTE
+from surfkit.evaluate.geometry.place import FileTransform, place_of, root_of
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
+from surfkit.io.glb import UNSIGNED_BYTE
 from surfkit.scene.srgb import from_linear
 
 SRGB_WRITERS = ("surfkit ", "https://github.com/mikedh/trimesh")
 """How `asset.generator` begins in files of programs that write bytes of sRGB to COLOR_0, as surfkit once did."""
-MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".stl")
 
 
 @dataclass(frozen=True)
-class Textured:
+class TexturedGlb:
     """A GLB file with pictures on its triangles."""
 
     path: Path
-    place: Place
+    place: FileTransform
 
 
-def textured(path: Path, root: dict[str, Any]) -> Textured | None:
+def textured(path: Path, root: dict[str, Any]) -> TexturedGlb | None:
     """A GLB file if its triangles have pictures, else None.
 
     A browser is sent such a file as it is, and would fetch whatever it names: one that names anything outside itself is
@@ -40,7 +40,7 @@ def textured(path: Path, root: dict[str, Any]) -> Textured | None:
     if outside := next(addresses(root), None):
         emit(Warned(f"{path}: the mesh is shown without pictures: it names {outside[:200]!r}, outside of the file"))
         return None
-    return Textured(path, place_of(path, root))
+    return TexturedGlb(path, place_of(path, root))
 
 
 def addresses(value: Any) -> Iterator[str]:
@@ -52,7 +52,7 @@ def addresses(value: Any) -> Iterator[str]:
         yield from addresses(item)
 
 
-def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, Place, Textured | None]:
+def other_mesh(path: Path) -> tuple[SurfaceFile, np.ndarray | None, FileTransform, TexturedGlb | None]:
     """A mesh that is no PLY file, in the frame of the input, with the (V, 3) uint8 colours of its vertices."""
     surface = read_surface(path)  # which says what is wrong with a file, before it is looked at more closely
     root = root_of(path)
@@ -105,7 +105,7 @@ def _has_srgb_bytes(root: dict[str, Any]) -> bool:
     """Whether a GLB file is of a program that writes bytes of sRGB where glTF has linear colours."""
     try:
         colors = root["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
-        is_bytes = root["accessors"][colors]["componentType"] == BYTE
+        is_bytes = root["accessors"][colors]["componentType"] == UNSIGNED_BYTE
         return is_bytes and str(root["asset"].get("generator")).startswith(SRGB_WRITERS)
     except (AttributeError, LookupError, TypeError):
         return False

@@ -6,21 +6,21 @@ import threading
 from typing import TYPE_CHECKING
 
 from surfkit.apps.view.glb import unlit_glb
-from surfkit.apps.view.mesh_files import Textured
-from surfkit.apps.view.pace import Pace
+from surfkit.apps.view.mesh_files import TexturedGlb
+from surfkit.apps.view.pace import DrawPace
 from surfkit.apps.view.plain import as_text
-from surfkit.apps.view.screen import WORLD, Latest, quaternion_of, telling
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.screen import WORLD, Debouncer, quaternion_of, telling
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.apps.view.splat_layer import add_budget
 from surfkit.mesh.base import Mesh
 
 if TYPE_CHECKING:
     import viser
 
-KIND = "triangles"
-OWN = "colours"
+MESH_KIND = "triangles"
+OWN_COLORS = "colours"
 """In the choice of colours, beside the values of the vertices."""
-SENT = 64_000_000
+MAX_UNASKED_BYTES = 64_000_000
 """Bytes of pictures and triangles up to which a browser is sent them without being asked."""
 
 
@@ -33,24 +33,24 @@ class MeshLayer:
         moves: Whether the camera does.
     """
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, mesh: Mesh) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace, mesh: Mesh) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.count = shelf, client, pace, len(mesh.faces)
         self.drawing, self.moves, self.asked = threading.Lock(), True, 0
         self.textured, bare = shelf.subject.textured, mesh.colors is None and shelf.subject.textured is None
-        sent = self.textured is not None and self.textured.path.stat().st_size <= SENT
+        sent = self.textured is not None and self.textured.path.stat().st_size <= MAX_UNASKED_BYTES
         gui = client.gui
         self.shown = gui.add_checkbox("mesh", shelf.subject.splats is None)
         self.budget = add_budget(gui, "most triangles", self.count, shelf.most)
         self.pictures = gui.add_checkbox("mesh with pictures", sent)
         self.plain = gui.add_checkbox("mesh in grey", bare and not mesh.values, disabled=bare and not mesh.values)
-        given = () if mesh.colors is None else (OWN,)
+        given = () if mesh.colors is None else (OWN_COLORS,)
         self.by = gui.add_dropdown("colours of the mesh", (*given, *mesh.values)) if mesh.values else None
         self.note = gui.add_markdown("")
         self.draw()
         for switch in (self.shown, self.pictures, self.plain, *([self.by] if self.by is not None else [])):
             switch.on_update(telling(client, lambda _: self.draw()))
-        self.budget.on_update(telling(client, Latest(self.draw)))
+        self.budget.on_update(telling(client, Debouncer(self.draw)))
 
     @property
     def whole(self) -> bool:
@@ -60,11 +60,11 @@ class MeshLayer:
     @property
     def value(self) -> str | None:
         """Which value of the vertices colours the mesh; None for its own colours."""
-        return None if self.by is None or self.plain.value or self.by.value == OWN else self.by.value
+        return None if self.by is None or self.plain.value or self.by.value == OWN_COLORS else self.by.value
 
     def wanted(self) -> int:
         """Triangles that are to be drawn now, at most."""
-        return self.pace.allowed(KIND, min(self.budget.value, self.count), moves=True)
+        return self.pace.allowed(MESH_KIND, min(self.budget.value, self.count), moves=True)
 
     def draw(self) -> None:
         """Send what the switches say."""
@@ -98,13 +98,13 @@ class MeshLayer:
         else:
             self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
         most = min(self.budget.value, self.count)
-        self.pace.sent(KIND, len(mesh.faces), most, each=3)
+        self.pace.sent(MESH_KIND, len(mesh.faces), most, each=3)
         if len(mesh.faces) == self.count:
             return f"all {self.count:,} triangles are shown"
-        words = self.pace.words(KIND, most, moves=True)
+        words = self.pace.words(MESH_KIND, most, moves=True)
         return f"{len(mesh.faces):,} triangles stand for {self.count:,}; clicks meet all{words}"
 
-    def _add_textured(self, textured: Textured) -> str:
+    def _add_textured(self, textured: TexturedGlb) -> str:
         """A file as it is, in its place; which it is, in words."""
         frame, place, data = self.shelf.subject.frame, textured.place, textured.path.read_bytes()
         self.client.scene.add_glb(

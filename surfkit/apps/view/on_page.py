@@ -9,12 +9,12 @@ import numpy as np
 
 from surfkit.scene.camera import Camera
 
-GREY = 128
+BESIDE_GREY = 128
 """Beside pictures that are not as wide as the window."""
 
 
 @dataclass(frozen=True)
-class OnPage:
+class FramedPictures:
     """Pictures of one camera side by side, in the middle of a window.
 
     Attributes:
@@ -64,7 +64,7 @@ def margins(shape: tuple[int, int], window: tuple[int, int]) -> tuple[int, int]:
 def framed(images: list[np.ndarray], window: tuple[int, int]) -> np.ndarray:
     """(*window, 3) uint8: pictures of one height side by side, with grey about them."""
     row = np.concatenate(images, axis=1)
-    (height, width), whole = row.shape[:2], np.full((*window, 3), GREY, np.uint8)
+    (height, width), whole = row.shape[:2], np.full((*window, 3), BESIDE_GREY, np.uint8)
     top, left = margins((height, width), window)
     whole[top : top + height, left : left + width] = row
     return whole

@@ -6,7 +6,7 @@ import numpy as np
 
 from surfkit.partition.base import Cells, Contraction
 
-SIDE = 24
+PIECES_PER_SIDE = 24
 """Pieces of a side of a block: sides are bent where the ground is contracted."""
 
 
@@ -29,7 +29,7 @@ def block_outlines(cells: Cells, positions: np.ndarray, up: np.ndarray) -> tuple
     for box, block in zip(cells.boxes, cells.blocks, strict=True):
         ring = outline(box, cells.contraction, low[:2], high[:2])
         top, bottom = (np.column_stack([ring, np.full(len(ring), height)]) for height in (high[2], low[2]))
-        corners = slice(0, None, SIDE)
+        corners = slice(0, None, PIECES_PER_SIDE)
         found = [np.stack([level, np.roll(level, -1, axis=0)], axis=1) for level in (top, bottom)]
         found.append(np.stack([top[corners], bottom[corners]], axis=1))
         segments += found
@@ -45,7 +45,7 @@ def outline(
     ends = (low, high) if contraction is None else (np.zeros(2), np.ones(2))
     x0, y0 = (end if value is None else value for value, end in zip(box[:2], ends[0], strict=True))
     x1, y1 = (end if value is None else value for value, end in zip(box[2:], ends[1], strict=True))
-    steps = np.arange(SIDE) / SIDE
+    steps = np.arange(PIECES_PER_SIDE) / PIECES_PER_SIDE
     corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     sides = np.roll(corners, -1, axis=0) - corners
     ring = (corners[:, None] + steps[:, None] * sides[:, None]).reshape(-1, 2)

@@ -24,30 +24,30 @@ if TYPE_CHECKING:
 PATH = "/surfkit/pace"
 LATE_S, AIM_S, EARLY_S = 1 / 10, 1 / 15, 1 / 20
 """Time of a picture: above which less is drawn, that which is aimed at then, and below which more is drawn again."""
-AT_REST = 3
+REST_FACTOR = 3
 """As many times more are drawn while the camera rests."""
-ENOUGH, LONG_S = 5, 1.0
+JUDGED_PICTURES, LONG_WINDOW_S = 5, 1.0
 """Pictures that are judged together; three of them if they took so long."""
-GROWTH = 1.5, 8.0
+GROWTH_FACTORS = 1.5, 8.0
 """Times that a limit grows at once, at least and at most."""
 SLOW_REST_S, REST_PICTURES = 1.0, 6
 """A slow browser's camera that has not moved for so long, and for the time of so many pictures, is at rest: it tells
 where it is once a picture."""
-HOLD_S = 10.0
+RAISE_HOLD_S = 10.0
 """After it was lowered, a limit is not raised for so long."""
-FIRST = {"splats": 5_000, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
+INITIAL_LIMITS = {"splats": 5_000, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
 """Limits of browsers without a graphics card to begin with, by kind."""
-LEAST = {"splats": 5_000, "splats as points": 10_000, "points": 10_000, "triangles": 10_000}
+MIN_LIMITS = {"splats": 5_000, "splats as points": 10_000, "points": 10_000, "triangles": 10_000}
 """No limits are lower."""
-FEW = 20_000
+MAX_UNASKED_ITEMS = 20_000
 """Things that any browser may be sent before it has said whether it has a graphics card."""
 HELLO_S = 2.0
 """For a browser to say whether it has a graphics card, before it is sent much."""
-MOST_TIMES = 100
+MAX_REQUEST_TIMES = 100
 """In a request."""
 
 
-class Limit:
+class DrawLimit:
     """Of things of one kind that are drawn, such that pictures come in time while the camera moves.
 
     Attributes:
@@ -60,7 +60,7 @@ class Limit:
 
     def allowed(self, wanted: int, moves: bool) -> int:
         """How many of those that a user wants are drawn."""
-        return wanted if self.most is None else min(wanted, self.most if moves else AT_REST * self.most)
+        return wanted if self.most is None else min(wanted, self.most if moves else REST_FACTOR * self.most)
 
     def judge(self, times: Sequence[float], drawn: int, wanted: int, now: float) -> None:
         """Set the limit by pictures that were drawn.
@@ -77,19 +77,24 @@ class Limit:
         if drawn != self.drawn:
             self.times, self.drawn = [], drawn
         self.times += times
-        if len(self.times) < (ENOUGH if sum(self.times) < LONG_S else 3):
+        if len(self.times) < (JUDGED_PICTURES if sum(self.times) < LONG_WINDOW_S else 3):
             return
         moving = min(drawn, self.allowed(wanted, moves=True))
         took = statistics.median(self.times) * moving / drawn
         self.times = []
         if took > LATE_S:
             self.most, self.lowered = max(int(moving * AIM_S / took), self.least), now
-        elif took < EARLY_S and self.most is not None and drawn <= self.most < wanted and now - self.lowered > HOLD_S:
-            low, high = GROWTH
+        elif (
+            took < EARLY_S
+            and self.most is not None
+            and drawn <= self.most < wanted
+            and now - self.lowered > RAISE_HOLD_S
+        ):
+            low, high = GROWTH_FACTORS
             self.most = int(self.most * min(max(AIM_S / max(took, 1e-9), low), high))
 
 
-class Pace:
+class DrawPace:
     """Limits of one browser, by kind, and the switch for them.
 
     Attributes:
@@ -103,7 +108,7 @@ class Pace:
         """Let the script know its client."""
         self.client = client
         self.follow: Callable[[], None] = lambda: None
-        self.limits: dict[str, Limit] = {}
+        self.limits: dict[str, DrawLimit] = {}
         self.shown: dict[str, tuple[int, int, int]] = {}
         self.took = 0.0
         self.software, self.said, self.answering = False, threading.Event(), threading.Lock()
@@ -136,8 +141,10 @@ class Pace:
             return ""
         return ". This browser draws slowly, so that it gets fewer than the slider allows"
 
-    def _limit(self, kind: str) -> Limit:
-        return self.limits.setdefault(kind, Limit(FIRST[kind] if self.software else None, LEAST[kind]))
+    def _limit(self, kind: str) -> DrawLimit:
+        return self.limits.setdefault(
+            kind, DrawLimit(INITIAL_LIMITS[kind] if self.software else None, MIN_LIMITS[kind])
+        )
 
     def _all(self) -> dict[str, int | None]:
         return {kind: limit.most for kind, limit in self.limits.copy().items()}
@@ -164,7 +171,7 @@ class Pace:
         return http.HTTPStatus.OK, ""
 
 
-def serve_paces(script: Script, find: Callable[[int], Pace | None]) -> None:
+def serve_paces(script: Script, find: Callable[[int], DrawPace | None]) -> None:
     """Add to the script of the pages what tells how fast they are, and answer it.
 
     Args:
@@ -187,9 +194,9 @@ def serve_paces(script: Script, find: Callable[[int], Pace | None]) -> None:
 
 def numbers(text: str) -> list[float] | None:
     """That a text with commas lists, if it does."""
-    parts = text.split(",", MOST_TIMES) if text else []
+    parts = text.split(",", MAX_REQUEST_TIMES) if text else []
     try:
         found = [float(part) for part in parts]
     except ValueError:
         return None
-    return found if len(found) <= MOST_TIMES and all(0 <= each < math.inf for each in found) else None
+    return found if len(found) <= MAX_REQUEST_TIMES and all(0 <= each < math.inf for each in found) else None

@@ -12,20 +12,20 @@ from surfkit.apps.render.path import beside
 from surfkit.apps.view.cursor import Cursor, serve_cursors
 from surfkit.apps.view.layers import Layers
 from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.pace import FEW, HELLO_S, Pace, serve_paces
-from surfkit.apps.view.photographs import Photographs
+from surfkit.apps.view.pace import HELLO_S, MAX_UNASKED_ITEMS, DrawPace, serve_paces
+from surfkit.apps.view.photographs import PhotoComparisonTool
 from surfkit.apps.view.screen import WORLD, ray_of, ray_through, telling
-from surfkit.apps.view.server import Served
-from surfkit.apps.view.shelf import MOST, Form, Shelf
-from surfkit.apps.view.subject import Subject
-from surfkit.apps.view.tools import CropTool, Measure, PathTool
+from surfkit.apps.view.server import RunningServer
+from surfkit.apps.view.shelf import DEFAULT_BUDGET, Form, SharedCache
+from surfkit.apps.view.subject import ViewerScene
+from surfkit.apps.view.tools import CropTool, MeasureTool, PathTool
 from surfkit.core.memory import give_back
 
 if TYPE_CHECKING:
     import viser
 
-WITHOUT = "coordinates are shown after a click, not under a pointer that moves"
-HELP = """
+CLICK_COORDINATES_NOTE = "coordinates are shown after a click, not under a pointer that moves"
+PAGE_HELP = """
 **Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
 
 **Keys.** W A S D: fly; Q E: down, up; arrows: turn. They work after a click into the picture.
@@ -36,7 +36,9 @@ HELP = """
 """
 
 
-def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form: Form | None = None) -> None:
+def show(
+    subject: ViewerScene, served: RunningServer, folder: Path, most: int = DEFAULT_BUDGET, form: Form | None = None
+) -> None:
     """Show a subject to every browser that comes.
 
     Args:
@@ -46,7 +48,7 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
         most: Splats, triangles and points that are sent to a browser to begin with.
         form: How splats are drawn to begin with; None leaves it to whether a browser has a graphics card.
     """
-    shelf = Shelf(subject, most, form)
+    shelf = SharedCache(subject, most, form)
     server = served.viser
     up, at, middle = first_view(subject)
     server.scene.set_up_direction(up)
@@ -54,22 +56,22 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     server.initial_camera.position = at * WORLD
     server.initial_camera.look_at = middle * WORLD
     threading.Thread(target=shelf.prepare, daemon=True).start()
-    pages: dict[int, Page] = {}
-    paces: dict[int, Pace] = {}
+    pages: dict[int, ViewerPage] = {}
+    paces: dict[int, DrawPace] = {}
 
     def cursor_of(client_id: int) -> Cursor | None:
         return page.cursor if (page := pages.get(client_id)) is not None else None
 
-    serve_cursors(served.script, cursor_of, WITHOUT)
+    serve_cursors(served.script, cursor_of, CLICK_COORDINATES_NOTE)
     serve_paces(served.script, paces.get)
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
-            pace = paces[client.client_id] = Pace(client)
-            if shelf.size > FEW and not served.script.missing:
+            pace = paces[client.client_id] = DrawPace(client)
+            if shelf.size > MAX_UNASKED_ITEMS and not served.script.missing:
                 pace.said.wait(HELLO_S)
-            pages[client.client_id] = Page(shelf, client, pace, folder, served)
+            pages[client.client_id] = ViewerPage(shelf, client, pace, folder, served)
             if client.client_id not in server.get_clients():  # it left meanwhile
                 leave(client)
 
@@ -86,21 +88,23 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
         give_back()
 
 
-class Page:
+class ViewerPage:
     """What one browser shows; another has its own layers, measures, box and path."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, folder: Path, served: Served) -> None:
+    def __init__(
+        self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace, folder: Path, served: RunningServer
+    ) -> None:
         """Build the page."""
         self.shelf, self.client, self.fov = shelf, client, client.camera.fov
         client.gui.add_button("show all").on_click(lambda _: self._show_all())
         self.layers = Layers(shelf, client, pace)
-        self.measure = Measure(shelf, client)
+        self.measure = MeasureTool(shelf, client)
         self.cursor = None if served.script.missing else self._follow_pointer()
-        self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
+        self.photographs = PhotoComparisonTool(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
         self.path = PathTool(shelf, client, folder, served.closing)
         with client.gui.add_folder("Help", expand_by_default=False):
-            client.gui.add_markdown(HELP)
+            client.gui.add_markdown(PAGE_HELP)
         client.scene.on_click()(telling(client, self._click))
 
     def _follow_pointer(self) -> Cursor:
@@ -136,7 +140,7 @@ class Page:
         return self.shelf.pick(origin, direction, mesh=self.layers.shows_mesh)
 
 
-def first_view(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def first_view(subject: ViewerScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Up, where the camera stands and what it looks at, local frame: from the side, half from above."""
     positions = subject.positions()
     rows = positions[:: max(1, len(positions) // 100_000)].astype(np.float64)

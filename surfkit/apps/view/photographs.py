@@ -9,28 +9,28 @@ import numpy as np
 
 from surfkit.apps.view.layers import Layers
 from surfkit.apps.view.picking import corners_of, hit_camera
-from surfkit.apps.view.pictures import KINDS, Kind, picture, thumbnail
+from surfkit.apps.view.pictures import PICTURE_KINDS, Kind, picture, thumbnail
 from surfkit.apps.view.plain import as_text
 from surfkit.apps.view.screen import REST_S, WORLD, quaternion_of, stand_at, telling, whole_view
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.core.check import BadInput
 
 if TYPE_CHECKING:
     import viser
 
-SMALL = 160
+THUMBNAIL_PX = 160
 """Of thumbnails, pixels; read only for the cameras that are near."""
-MOST_NEAR = 60
-HERE = 0.05
+MAX_NEARBY_THUMBNAILS = 60
+AT_CAMERA_DISTANCE = 0.05
 """Distance up to which one stands at a camera, of the size of its picture."""
-TURNING = 0.5
+TURNING_DISTANCE = 0.5
 """Distance of the place about which the mouse turns when one stands at a camera, local units."""
 
 
-class Photographs:
+class PhotoComparisonTool:
     """Chooses a camera, and shows what was seen and what is drawn from it."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, layers: Layers) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, layers: Layers) -> None:
         """Build the panel; no photograph is read yet."""
         self.shelf, self.client, self.layers = shelf, client, layers
         self.views = shelf.subject.views
@@ -43,10 +43,10 @@ class Photographs:
         with gui.add_folder("Photographs"):
             self.number = gui.add_number("camera", 1, min=1, max=len(self.views), step=1)
             step = gui.add_button_group("go to", ("previous", "next", "stand there"))
-            self.kind = gui.add_dropdown("show", KINDS)
+            self.kind = gui.add_dropdown("show", PICTURE_KINDS)
             self.plane = gui.add_checkbox("picture in place", True, hint="In the plane of the camera, in space.")
             self.follow = gui.add_checkbox("stand there on a click", True)
-            self.few = gui.add_slider("thumbnails near me", 0, MOST_NEAR, 1, 0)
+            self.few = gui.add_slider("thumbnails near me", 0, MAX_NEARBY_THUMBNAILS, 1, 0)
             self.told = gui.add_markdown("Click on a camera.")
             self.panel = gui.add_image(np.full((2, 3, 3), 255, np.uint8), visible=False)
         self.number.on_update(telling(client, lambda event: self._numbered(event)))
@@ -63,7 +63,9 @@ class Photographs:
         """
         if not self.layers.camera_size:
             return None
-        away = np.flatnonzero(np.linalg.norm(self.centres - origin, axis=1) > HERE * self.layers.camera_size)
+        away = np.flatnonzero(
+            np.linalg.norm(self.centres - origin, axis=1) > AT_CAMERA_DISTANCE * self.layers.camera_size
+        )
         _, corners = corners_of([self.cameras[at] for at in away], self.layers.camera_size)
         met = hit_camera(corners, origin, direction)
         return None if met is None else int(away[met])
@@ -82,7 +84,7 @@ class Photographs:
         if self.chosen is None:
             raise BadInput("no camera is chosen yet: click on one, or give its number")
         camera = self.cameras[self.chosen]
-        stand_at(self.client, camera.world_to_camera.numpy(), TURNING)
+        stand_at(self.client, camera.world_to_camera.numpy(), TURNING_DISTANCE)
         self.client.camera.fov = whole_view(camera, self.client.camera.aspect)
 
     def show(self) -> None:
@@ -155,4 +157,4 @@ class Photographs:
             self.near.pop(gone).remove()
         for index in nearest:
             if index not in self.near:
-                self.near[index] = self._add_image(f"/near/{index}", index, thumbnail(self.views[index], SMALL))
+                self.near[index] = self._add_image(f"/near/{index}", index, thumbnail(self.views[index], THUMBNAIL_PX))

@@ -13,17 +13,17 @@ from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
-PER_CELL = 256
+ITEMS_PER_CELL = 256
 """Triangles or points that are looked at together, about."""
-MOST_WITHIN, SAMPLE = (1, 99), 100_000
+GRID_PERCENTILES, SAMPLED_PLACES = (1, 99), 100_000
 """Percentiles of about so many places between which the cells lie."""
-FOCAL = 1000.0
+PICK_FOCAL_PX = 1000.0
 """Pixels: of the picture of a single ray, about that of a window."""
-SEEN = 0.5
+MIN_PICKED_ALPHA = 0.5
 """Of the light that a ray must lose to have met something."""
 
 
-class Triangles:
+class TrianglePicker:
     """Triangles that are found quickly: sorted into the cells of a grid, with the bounding box of each cell."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -50,7 +50,7 @@ class Triangles:
         return best if np.isfinite(best) else None
 
 
-class Places:
+class PointPicker:
     """Points that are found quickly: sorted like triangles."""
 
     def __init__(self, xyz: np.ndarray) -> None:
@@ -75,8 +75,10 @@ class Places:
 
 def into_cells(middles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The order of (N, 3) places by the cells of a grid, and where each cell that has some begins and ends in it."""
-    low, high = np.percentile(middles[:: max(1, len(middles) // SAMPLE)].astype(np.float64), MOST_WITHIN, axis=0)
-    parts = max(1, round(np.sqrt(len(middles) / PER_CELL)))  # a surface fills as many cells as a square has
+    low, high = np.percentile(
+        middles[:: max(1, len(middles) // SAMPLED_PLACES)].astype(np.float64), GRID_PERCENTILES, axis=0
+    )
+    parts = max(1, round(np.sqrt(len(middles) / ITEMS_PER_CELL)))  # a surface fills as many cells as a square has
     cells = (middles - low) / max(float((high - low).max()), 1e-30) * parts
     cells = cells.clip(0, parts - 1).astype(np.int64)  # what lies far away is in the cells at the rim
     keys = (cells[:, 0] * parts + cells[:, 1]) * parts + cells[:, 2]
@@ -122,7 +124,7 @@ def hit_splats(draw: Callable[[View], Maps], origin: np.ndarray, direction: np.n
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
     pose[:3, 3] = -pose[:3, :3] @ torch.from_numpy(np.asarray(origin, np.float64))
-    maps = draw(View("", Camera(pose, FOCAL, FOCAL, 0.5, 0.5, 1, 1), Path()))
+    maps = draw(View("", Camera(pose, PICK_FOCAL_PX, PICK_FOCAL_PX, 0.5, 0.5, 1, 1), Path()))
     found = surface_depth(maps)
     depth = 0.0 if found is None else float(found[0, 0])
     return depth if depth > 0 else None
@@ -137,7 +139,7 @@ def surface_depth(maps: Maps) -> Tensor | None:
         return maps.median
     if maps.depth is None or maps.alpha is None:
         return None
-    return torch.where(maps.alpha > SEEN, maps.expected_depth(), 0.0)
+    return torch.where(maps.alpha > MIN_PICKED_ALPHA, maps.expected_depth(), 0.0)
 
 
 def hit_points(xyz: np.ndarray, origin: np.ndarray, direction: np.ndarray, spread: float) -> float | None:

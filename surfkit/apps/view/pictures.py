@@ -19,10 +19,10 @@ from surfkit.scene.photos import read_draft, view_photo
 from surfkit.scene.scene import Frame, View
 
 Kind = Literal["photograph", "render", "depth", "normal", "error"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
-LONGEST = 1600
+PICTURE_KINDS: tuple[Kind, ...] = get_args(Kind)
+MAX_DRAWN_PX = 1600
 """Of the pictures that are drawn, pixels."""
-WORST = 0.25
+WORST_ERROR = 0.25
 """Error from which on the colour is the palest, of values from 0 to 1."""
 
 
@@ -38,7 +38,7 @@ def picture(view: View, kind: Kind, draw: Callable[[View], Maps] | None, frame: 
     Raises:
         BadInput: The photograph cannot be read, or the model draws no such maps.
     """
-    view = replace(view, camera=view.camera.fitted(LONGEST))
+    view = replace(view, camera=view.camera.fitted(MAX_DRAWN_PX))
     if kind == "photograph":
         return _bytes(view_photo(view).float() / 255), f"{view.camera.width} × {view.camera.height} pixels"
     if draw is None:
@@ -70,10 +70,10 @@ def error_picture(maps: Maps, photo: Tensor) -> tuple[np.ndarray, str]:
     """
     color = maps.color.detach().cpu().float().clamp(0, 1)
     error = (color - photo).abs().mean(0)
-    steps = np.linspace(0, WORST, len(RAMP))
+    steps = np.linspace(0, WORST_ERROR, len(RAMP))
     colors = np.stack([np.interp(error.numpy(), steps, RAMP[:, i]) for i in range(3)], axis=2)
     ratio = f"{psnr(color, photo):.2f} dB" if error.any() else "infinite"
-    ends = f"dark is 0, the palest {WORST:.0%} and more"
+    ends = f"dark is 0, the palest {WORST_ERROR:.0%} and more"
     told = f"|render - photograph|: {ends}; mean {float(error.mean()):.1%}, PSNR {ratio}"
     return np.round(colors * 255).astype(np.uint8), told
 

@@ -6,9 +6,9 @@ import re
 
 from surfkit.core.check import printable
 
-MARKS = re.compile(r"([\\`*_\[\]<>#|~&])")
+MARKUP_PATTERN = re.compile(r"([\\`*_\[\]<>#|~&])")
 """What Markdown and HTML begin with within a line; CommonMark takes each for itself behind a backslash."""
-LIST = re.compile(r"(?=[-+=\d])")
+LIST_PATTERN = re.compile(r"(?=[-+=\d])")
 """What may begin a list, or underline a title, at the beginning of a line."""
 LINKS = re.compile(r"(www(?=\.)|:(?=//)|@)", re.IGNORECASE)
 """What GitHub's Markdown, which the page speaks, makes links of after the backslashes are gone."""
@@ -19,7 +19,7 @@ JOINER = "\u2060"
 def as_text(text: object) -> str:
     """Markdown that shows a text as it is: no mark in it makes a tag, a link, a picture or bold letters."""
     shown = LINKS.sub(rf"\1{JOINER}", printable(str(text)))
-    return MARKS.sub(r"\\\1", JOINER + shown if LIST.match(shown) else shown)
+    return MARKUP_PATTERN.sub(r"\\\1", JOINER + shown if LIST_PATTERN.match(shown) else shown)
 
 
 def as_code(text: object) -> str:

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfkit.apps.view.display import some
-from surfkit.apps.view.pace import Pace
-from surfkit.apps.view.screen import Latest, Place, telling
-from surfkit.apps.view.shelf import LARGER, Shelf
+from surfkit.apps.view.pace import DrawPace
+from surfkit.apps.view.screen import CameraPose, Debouncer, telling
+from surfkit.apps.view.shelf import MAX_POINT_ENLARGEMENT, SharedCache
 from surfkit.apps.view.splat_layer import add_budget, add_points
-from surfkit.apps.view.subject import Points
+from surfkit.apps.view.subject import ViewerPoints
 
 if TYPE_CHECKING:
     import viser
 
-KIND = "points"
+POINT_KIND = "points"
 
 
 class PointLayer:
@@ -28,10 +28,10 @@ class PointLayer:
         moves: Whether the camera does.
     """
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, points: Points) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace, points: ViewerPoints) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.points = shelf, client, pace, points
-        self.drawing, self.moves, self.place = threading.Lock(), True, Place(client)
+        self.drawing, self.moves, self.place = threading.Lock(), True, CameraPose(client)
         self.asked, self.rows, self.larger = 0, np.zeros(0, np.int64), 1.0
         alone = shelf.subject.splats is None and shelf.subject.mesh is None
         gui = client.gui
@@ -42,7 +42,7 @@ class PointLayer:
         self.draw()
         self.shown.on_update(telling(client, lambda _: self.draw()))
         for slider in (self.size, self.budget):
-            slider.on_update(telling(client, Latest(self.draw)))
+            slider.on_update(telling(client, Debouncer(self.draw)))
 
     @property
     def most(self) -> int:
@@ -51,7 +51,7 @@ class PointLayer:
 
     def wanted(self) -> int:
         """That are to be drawn now."""
-        return self.pace.allowed(KIND, self.most, self.moves)
+        return self.pace.allowed(POINT_KIND, self.most, self.moves)
 
     def draw(self) -> None:
         """Send what the switches say."""
@@ -68,7 +68,7 @@ class PointLayer:
         self.asked, larger = asked, 1.0
         if asked < len(self.rows) < most and self.moves:  # at once, and those that are nearer follow
             rows = self.rows[some(len(self.rows), asked)]
-            larger = min(self.larger * math.sqrt(len(self.rows) / asked), LARGER)
+            larger = min(self.larger * math.sqrt(len(self.rows) / asked), MAX_POINT_ENLARGEMENT)
         elif asked < most:
             stand = self.place.begin()
             rows, larger = self.shelf.points_for_eye(asked, stand.eye)
@@ -78,8 +78,10 @@ class PointLayer:
             rows = some(count, most)
         add_points(self.client, "/points", self.points.xyz[rows], self.points.rgb[rows], larger * self.size.value)
         self.rows, self.larger = rows, larger
-        self.pace.sent(KIND, len(rows), most)
-        self.note.content = f"{len(rows):,} of {count:,} points are shown{self.pace.words(KIND, most, self.moves)}"
+        self.pace.sent(POINT_KIND, len(rows), most)
+        self.note.content = (
+            f"{len(rows):,} of {count:,} points are shown{self.pace.words(POINT_KIND, most, self.moves)}"
+        )
 
     def follow(self) -> None:
         """Draw as many as the browser can draw in time while the camera moves, or rests, and those near it."""

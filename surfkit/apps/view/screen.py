@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from surfkit.apps.view.by_view import Eye
+from surfkit.apps.view.by_view import LodCamera
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import numpy_quaternions, numpy_rotations
@@ -28,11 +28,11 @@ TICK_S = 0.1
 """Between two looks at a camera that moves."""
 BETWEEN_S = 1.0
 """From one choice to the next, at least, while the camera moves."""
-FAR, FAR_DEGREES = 0.25, 15.0
+FAR_MOVE_SHARE, FAR_DEGREES = 0.25, 15.0
 """A camera has moved far when it has gone this share of the way to what it turns about, or has turned by so much."""
 
 
-class Latest:
+class Debouncer:
     """Does what was asked for last, after a moment of rest: sliders send each place that they pass."""
 
     def __init__(self, action: Callable[[], None]) -> None:
@@ -48,7 +48,7 @@ class Latest:
             self.action()
 
 
-class Following:
+class CameraFollower:
     """Looks where a camera is, in a thread of its own: while it moves, and when it has come to rest."""
 
     def __init__(self, action: Callable[[bool], None], rest: Callable[[], float] = lambda: REST_S) -> None:
@@ -83,7 +83,7 @@ class Following:
 
 
 @dataclass(frozen=True)
-class Stand:
+class BrowserCamera:
     """Where a browser's camera is.
 
     Attributes:
@@ -91,54 +91,54 @@ class Stand:
         distance: Of what it turns about, local units.
     """
 
-    eye: Eye
+    eye: LodCamera
     distance: float
 
     @classmethod
-    def of(cls, camera: viser.CameraHandle) -> Stand:
+    def of(cls, camera: viser.CameraHandle) -> BrowserCamera:
         """That of now."""
         width, height = max(int(camera.image_width), 1), max(int(camera.image_height), 1)
         focal = height / 2 / math.tan(camera.fov / 2)
         pose = torch.from_numpy(pose_of(camera))
         lens = Camera(pose, focal, focal, width / 2, height / 2, width, height)
         away = float(np.linalg.norm(np.asarray(camera.look_at) - np.asarray(camera.position)))
-        return cls(Eye(lens, camera.near / WORLD), away / WORLD)
+        return cls(LodCamera(lens, camera.near / WORLD), away / WORLD)
 
-    def same_as(self, other: Stand) -> bool:
+    def same_as(self, other: BrowserCamera) -> bool:
         """Whether both see the same."""
         one, two = self.eye.camera, other.eye.camera
         lenses = [(each.fx, each.width, each.height) for each in (one, two)]
         return lenses[0] == lenses[1] and torch.equal(one.world_to_camera, two.world_to_camera)
 
-    def far_from(self, other: Stand) -> bool:
+    def far_from(self, other: BrowserCamera) -> bool:
         """Whether the camera has moved far since it was there."""
         one, two = self.eye.camera, other.eye.camera
         gone = float((one.centre - two.centre).norm())
         ahead = float(one.world_to_camera[2, :3] @ two.world_to_camera[2, :3])
-        return gone > FAR * other.distance or ahead < math.cos(math.radians(FAR_DEGREES))
+        return gone > FAR_MOVE_SHARE * other.distance or ahead < math.cos(math.radians(FAR_DEGREES))
 
 
-class Place:
+class CameraPose:
     """Where a browser's camera was when things were last chosen for it."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         """Nowhere yet."""
         self.client, self.chosen = client, 0.0
-        self.stand: Stand | None = None
+        self.stand: BrowserCamera | None = None
 
-    def begin(self) -> Stand:
+    def begin(self) -> BrowserCamera:
         """Where it is now: things are about to be chosen."""
         self.chosen, self.stand = time.monotonic(), None
-        return Stand.of(self.client.camera)
+        return BrowserCamera.of(self.client.camera)
 
-    def serves(self, stand: Stand, fewer: bool = False) -> bool:
+    def serves(self, stand: BrowserCamera, fewer: bool = False) -> bool:
         """Whether what was chosen for a camera is still wanted; if not, the next choice is.
 
         Args:
             stand: That camera.
             fewer: It is less than the browser has, which is too slow for more: it is wanted in any case.
         """
-        if Stand.of(self.client.camera).far_from(stand):
+        if BrowserCamera.of(self.client.camera).far_from(stand):
             return fewer
         self.stand = stand
         return True
@@ -147,7 +147,7 @@ class Place:
         """Whether to choose again."""
         if moves and time.monotonic() - self.chosen < BETWEEN_S:
             return False
-        here = Stand.of(self.client.camera)
+        here = BrowserCamera.of(self.client.camera)
         return self.stand is None or (here.far_from(self.stand) if moves else not here.same_as(self.stand))
 
 

@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from surfkit.apps.view.answers import Script, response
-from surfkit.apps.view.gate import Asked, Gate
+from surfkit.apps.view.gate import AuthRequest, TokenAuth
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.optional import needed
 
@@ -37,7 +37,7 @@ LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 100
 """Where a free port is looked for, if none is asked for."""
 PORT_NUMBERS = range(1, 65536)
-CLOSE_S = 1.0
+BROWSER_CLOSE_S = 1.0
 """For a browser to say that it has heard the end."""
 SILENT = logging.getLogger("surfkit.apps.view.requests")
 SILENT.setLevel(logging.CRITICAL)  # a request that is refused is no event of the program
@@ -65,7 +65,7 @@ class Address:
 
 
 @dataclass(frozen=True)
-class Served:
+class RunningServer:
     """A server that runs.
 
     Attributes:
@@ -93,7 +93,7 @@ def refuse_wrong_port(port: int | None, flag: str) -> None:
 
 
 @contextmanager
-def served(address: Address, title: str, what: str = "surfkit view") -> Iterator[Served]:
+def served(address: Address, title: str, what: str = "surfkit view") -> Iterator[RunningServer]:
     """Within, a server with an empty scene.
 
     Args:
@@ -106,7 +106,7 @@ def served(address: Address, title: str, what: str = "surfkit view") -> Iterator
     """
     package = require_viser(what)
     listener = listen(address)
-    gate, script = Gate(secrets.token_urlsafe(24), listener.getsockname()[1]), Script()
+    gate, script = TokenAuth(secrets.token_urlsafe(24), listener.getsockname()[1]), Script()
     try:
         with _gated(gate, listener, script) as used, _quiet():
             server = package.ViserServer(address.host, gate.port, label=title, verbose=False)
@@ -116,7 +116,7 @@ def served(address: Address, title: str, what: str = "surfkit view") -> Iterator
                 raise Fault(f"viser {package.__version__} starts its server in an unknown way: pip install 'viser<1.2'")
             _never_share(server)
             url = f"http://{_shown_host(address.host)}:{gate.port}/?token={gate.token}"
-            yield Served(server, url, closing, script)
+            yield RunningServer(server, url, closing, script)
         finally:
             closing.set()
             with _quiet():
@@ -167,7 +167,7 @@ def _shown_host(host: str) -> str:
 
 
 @contextmanager
-def _gated(gate: Gate, listener: socket.socket, script: Script) -> Iterator[list[bool]]:
+def _gated(gate: TokenAuth, listener: socket.socket, script: Script) -> Iterator[list[bool]]:
     """Within, the server that viser starts serves at `listener`, asks the gate first, and has the script on its page.
 
     viser has no place for a hook of its own, so that the function by which it opens its port is replaced for as long as
@@ -186,7 +186,7 @@ def _gated(gate: Gate, listener: socket.socket, script: Script) -> Iterator[list
             return script.into(process_request(connection, request))
 
         used.append(True)
-        settings |= {"process_request": answer, "logger": SILENT, "close_timeout": CLOSE_S}
+        settings |= {"process_request": answer, "logger": SILENT, "close_timeout": BROWSER_CLOSE_S}
         return plain(handler, sock=listener, **settings)
 
     with PATCHING:
@@ -197,10 +197,10 @@ def _gated(gate: Gate, listener: socket.socket, script: Script) -> Iterator[list
             library.serve = plain
 
 
-def _refusal_or_cookie(gate: Gate, request: Any) -> Any:
+def _refusal_or_cookie(gate: TokenAuth, request: Any) -> Any:
     """The answer to a request that is not let through, or that has yet to change the token for a cookie; else None."""
     headers = request.headers
-    asked = Asked(request.path, *(headers.get_all(name) for name in ("Cookie", "Origin", "Host")))
+    asked = AuthRequest(request.path, *(headers.get_all(name) for name in ("Cookie", "Origin", "Host")))
     if not gate.admits(asked):
         return response(http.HTTPStatus.FORBIDDEN, "surfkit view: open the address that the terminal shows\n")
     is_page = "upgrade" not in headers

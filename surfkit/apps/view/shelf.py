@@ -12,10 +12,10 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from surfkit.apps.view.by_view import Chosen, Eye, Levels, Lot, PointLot
+from surfkit.apps.view.by_view import ChosenSplats, LodCamera, LodSplats, SampledPoints, SampledSplats
 from surfkit.apps.view.display import (
+    BrowserSplats,
     Colors,
-    Drawn,
     by_block,
     by_height,
     by_normal,
@@ -26,9 +26,9 @@ from surfkit.apps.view.display import (
     normals_of,
     unit_of,
 )
-from surfkit.apps.view.picking import Places, Triangles, hit_splats
+from surfkit.apps.view.picking import PointPicker, TrianglePicker, hit_splats
 from surfkit.apps.view.plain import as_code
-from surfkit.apps.view.subject import Subject
+from surfkit.apps.view.subject import ViewerScene
 from surfkit.io.splats.table import SplatTable
 from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.mesh.values import by_value, ends_of, words_of
@@ -38,17 +38,17 @@ from surfkit.scene.scene import View
 from surfkit.scene.up_direction import map_axes
 
 Form = Literal["splats", "points", "points-while-moving"]
-FORMS: tuple[Form, ...] = get_args(Form)
-MOST = 1_000_000
+SPLAT_FORMS: tuple[Form, ...] = get_args(Form)
+DEFAULT_BUDGET = 1_000_000
 CONE = 0.004
 """Radius, at distance 1, of the cone in which a click finds a point: four pixels of a window, about."""
-LARGER = 4.0
+MAX_POINT_ENLARGEMENT = 4.0
 """Points that stand for others are larger by no more than this: else they hide what is near them."""
-KEPT = 2
+CACHED_CHOICES = 2
 """Choices of splats, and of triangles, that are kept: that of now and that of before."""
 
 
-class Shelf:
+class SharedCache:
     """A subject, and what has been made of it.
 
     Attributes:
@@ -60,17 +60,17 @@ class Shelf:
             card, and as splats in others.
     """
 
-    def __init__(self, subject: Subject, most: int = MOST, form: Form | None = None) -> None:
+    def __init__(self, subject: ViewerScene, most: int = DEFAULT_BUDGET, form: Form | None = None) -> None:
         """Nothing is made yet."""
         self.subject, self.most, self.form = subject, most, form
         self.axes = map_axes(subject.up)
         self.heights = height_bounds(subject.positions() @ subject.up)
         self.drawing, self.making = threading.Lock(), threading.RLock()
-        self._triangles: Triangles | None = None
-        self._places: Places | None = None
-        self._splats = lru_cache(KEPT)(self._choose_splats)
-        self._mesh = lru_cache(KEPT)(self._choose_mesh)
-        self._ends = lru_cache(KEPT)(self._ends_of)
+        self._triangles: TrianglePicker | None = None
+        self._places: PointPicker | None = None
+        self._splats = lru_cache(CACHED_CHOICES)(self._choose_splats)
+        self._mesh = lru_cache(CACHED_CHOICES)(self._choose_mesh)
+        self._ends = lru_cache(CACHED_CHOICES)(self._ends_of)
 
     @property
     def size(self) -> int:
@@ -88,7 +88,7 @@ class Shelf:
         plan: tuple[Colors, ...] = ("block",) if self.subject.plan is not None else ()
         return ("as trained", "height", "normal", *plan)
 
-    def splats(self, budget: int, colors: Colors) -> tuple[Drawn, str]:
+    def splats(self, budget: int, colors: Colors) -> tuple[BrowserSplats, str]:
         """At most `budget` splats, and a line that says which."""
         with self.making:
             return self._splats(budget, colors)
@@ -111,22 +111,22 @@ class Shelf:
         return ends_of(value, self.subject.mesh.values[value])
 
     @property
-    def triangles(self) -> Triangles:
+    def triangles(self) -> TrianglePicker:
         """Of the whole mesh, for clicks."""
         with self.making:
             if self._triangles is None:
                 mesh = self.subject.mesh
                 assert mesh is not None
-                self._triangles = Triangles(mesh.vertices, mesh.faces)
+                self._triangles = TrianglePicker(mesh.vertices, mesh.faces)
             return self._triangles
 
     @property
-    def places(self) -> Places:
+    def places(self) -> PointPicker:
         """Of all points, for clicks."""
         with self.making:
             if self._places is None:
                 points = self.subject.points
-                self._places = Places(points.xyz if points is not None else self.subject.positions())
+                self._places = PointPicker(points.xyz if points is not None else self.subject.positions())
             return self._places
 
     def prepare(self) -> None:
@@ -170,11 +170,11 @@ class Shelf:
         assert self.subject.mesh is not None
         return fewer_faces(self.subject.mesh, budget)
 
-    def _choose_splats(self, budget: int, colors: Colors) -> tuple[Drawn, str]:
+    def _choose_splats(self, budget: int, colors: Colors) -> tuple[BrowserSplats, str]:
         table, told = self.within(budget)
         return self.drawn(table, colors), told
 
-    def drawn(self, table: SplatTable, colors: Colors) -> Drawn:
+    def drawn(self, table: SplatTable, colors: Colors) -> BrowserSplats:
         """Splats of the model, or such as stand for them, in the colours that are asked for."""
         return drawn(table, self.painted(table, colors), self.unit)
 
@@ -192,7 +192,7 @@ class Shelf:
         chosen = self.lot.choose(budget).table
         return chosen, f"{len(chosen):,} splats, drawn by lot and enlarged, stand for {len(table):,}{self._remedy()}"
 
-    def for_eye(self, budget: int, eye: Eye) -> tuple[Chosen, str]:
+    def for_eye(self, budget: int, eye: LodCamera) -> tuple[ChosenSplats, str]:
         """At most `budget` splats for one camera, of a model that has more; and a line that says which."""
         table = self.subject.splats
         assert table is not None
@@ -205,14 +205,14 @@ class Shelf:
                 told = f"{len(found):,} splats, drawn by lot and enlarged, stand for {len(table):,}"
         return found, f"{told}: fine where you are, coarse far away, few beside the picture{self._remedy()}"
 
-    def points_for_eye(self, budget: int, eye: Eye) -> tuple[np.ndarray, float]:
+    def points_for_eye(self, budget: int, eye: LodCamera) -> tuple[np.ndarray, float]:
         """(n,) rows of `budget` of the points, of which there are more, for one camera.
 
         Also how many times larger they are drawn, so that they stand for the others; not more than LARGER.
         """
         with self.making:
             rows, raised = self.point_lot.rows(budget, eye)
-        return rows.numpy(), min(math.exp(float(raised.median()) / 2), LARGER)
+        return rows.numpy(), min(math.exp(float(raised.median()) / 2), MAX_POINT_ENLARGEMENT)
 
     def _remedy(self) -> str:
         """How to get levels of detail, for a run that has none."""
@@ -222,21 +222,21 @@ class Shelf:
         return f". {command} makes levels of detail, which look better"
 
     @cached_property
-    def levels(self) -> Levels | None:
+    def levels(self) -> LodSplats | None:
         """Of the model, where it has some."""
-        return Levels(self.subject.levels) if self.subject.levels is not None else None
+        return LodSplats(self.subject.levels) if self.subject.levels is not None else None
 
     @cached_property
-    def lot(self) -> Lot:
+    def lot(self) -> SampledSplats:
         """Of the model."""
         assert self.subject.splats is not None
-        return Lot(self.subject.splats)
+        return SampledSplats(self.subject.splats)
 
     @cached_property
-    def point_lot(self) -> PointLot:
+    def point_lot(self) -> SampledPoints:
         """Of the points."""
         assert self.subject.points is not None
-        return PointLot(torch.from_numpy(self.subject.points.xyz))
+        return SampledPoints(torch.from_numpy(self.subject.points.xyz))
 
     @cached_property
     def unit(self) -> float:

@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surfkit.apps.view.by_view import Chosen, in_places
+from surfkit.apps.view.by_view import ChosenSplats, in_places
 from surfkit.apps.view.display import Colors
-from surfkit.apps.view.pace import Pace
-from surfkit.apps.view.screen import WORLD, Latest, Place, telling
-from surfkit.apps.view.shelf import FORMS, Form, Shelf
+from surfkit.apps.view.pace import DrawPace
+from surfkit.apps.view.screen import WORLD, CameraPose, Debouncer, telling
+from surfkit.apps.view.shelf import SPLAT_FORMS, Form, SharedCache
 
 if TYPE_CHECKING:
     import viser
 
-MOVING = 100_000
+MAX_MOVING_POINTS = 100_000
 """Points while the camera moves."""
-FINER = "Splats are chosen for where you are, again when you rest. Otherwise they are chosen once, for all places."
-STEP = 10_000
+FINER_NOTE = "Splats are chosen for where you are, again when you rest. Otherwise they are chosen once, for all places."
+SLIDER_STEP = 10_000
 """Of the sliders."""
-DOT = 200.0
+SPLAT_DOT_SIZE = 200.0
 """Size of splats that are drawn as points, thousandths of `Drawn.unit`: two standard deviations."""
 
 
 @dataclass(frozen=True)
-class Asked:
+class SplatRequest:
     """Splats for a browser: drawn as what, how many its user allows, and how many of these it can draw in time."""
 
     kind: str
@@ -42,36 +42,36 @@ class SplatLayer:
         moves: Whether the camera does.
     """
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, count: int) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace, count: int) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.count = shelf, client, pace, count
         self.drawing, self.moves, self.node = threading.Lock(), True, None
-        self.asked: Asked | None = None
+        self.asked: SplatRequest | None = None
         self.has = 0
-        self.place, self.places = Place(client), np.zeros(0, np.int64)
+        self.place, self.places = CameraPose(client), np.zeros(0, np.int64)
         gui = client.gui
         self.shown = gui.add_checkbox("splats", True)
         form: Form = shelf.form or ("points" if pace.software else "splats")
-        self.form = gui.add_dropdown("draw as", FORMS, initial_value=form, hint="Points are less work.")
+        self.form = gui.add_dropdown("draw as", SPLAT_FORMS, initial_value=form, hint="Points are less work.")
         self.colors = gui.add_dropdown("colours", shelf.colors)
         self.budget = add_budget(gui, "most splats", count, shelf.most)
-        self.near_me = gui.add_checkbox("finer where I am", True, hint=FINER)
+        self.near_me = gui.add_checkbox("finer where I am", True, hint=FINER_NOTE)
         self.note = gui.add_markdown("")
         self.draw()
         for switch in (self.shown, self.form, self.colors, self.near_me):
             switch.on_update(telling(client, lambda _: self.draw()))
-        self.budget.on_update(telling(client, Latest(self.draw)))
+        self.budget.on_update(telling(client, Debouncer(self.draw)))
 
-    def wanted(self) -> Asked:
+    def wanted(self) -> SplatRequest:
         """What the switches and the pace of the browser ask for now."""
         as_points = self.form.value == "points" or (self.form.value == "points-while-moving" and self.moves)
         most = min(self.budget.value, self.count)
         if self.moves and self.form.value == "points-while-moving":
-            most = min(most, MOVING)
+            most = min(most, MAX_MOVING_POINTS)
         kind = "splats as points" if as_points else "splats"
-        return Asked(kind, most, self.pace.allowed(kind, most, self.moves))
+        return SplatRequest(kind, most, self.pace.allowed(kind, most, self.moves))
 
-    def by_view(self, asked: Asked) -> bool:
+    def by_view(self, asked: SplatRequest) -> bool:
         """Whether the splats are chosen for the camera: there are more than the browser is to have."""
         return self.near_me.value and self.count > asked.budget
 
@@ -88,7 +88,7 @@ class SplatLayer:
                 self.node.remove()
                 self.node = None
 
-    def _send(self, asked: Asked) -> None:
+    def _send(self, asked: SplatRequest) -> None:
         colors: Colors = self.colors.value
         budget, as_points = asked.budget, asked.kind == "splats as points"
         if self.by_view(asked):
@@ -102,7 +102,7 @@ class SplatLayer:
         else:
             found, told = self.shelf.splats(budget, colors)
         if as_points:
-            self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * found.unit)
+            self.node = add_points(self.client, "/splats", found.means, found.rgb, SPLAT_DOT_SIZE * found.unit)
         else:
             self.node = self.client.scene.add_gaussian_splats(
                 "/splats",
@@ -118,7 +118,7 @@ class SplatLayer:
         legend = {"height": f"; {self.shelf.height_words()}", "normal": "; red east, green north, blue up"}
         self.note.content = told + legend.get(colors, "")
 
-    def _places_of(self, chosen: Chosen, budget: int) -> np.ndarray:
+    def _places_of(self, chosen: ChosenSplats, budget: int) -> np.ndarray:
         """Places in the list of the browser, in which those stay that it has."""
         before = self.places if len(self.places) == budget else np.full(budget, -1)
         found = in_places(before, chosen.ids)
@@ -142,5 +142,5 @@ def add_points(client: viser.ClientHandle, name: str, xyz: np.ndarray, rgb: np.n
 
 def add_budget(gui: viser.GuiApi, label: str, count: int, most: int) -> viser.GuiSliderHandle[int]:
     """A slider for how many of `count` are shown, `most` of them at first; it ends where all are."""
-    end = max(-(-count // STEP) * STEP, 1)
-    return gui.add_slider(label, min(STEP, count, most), end, STEP, min(most, end))
+    end = max(-(-count // SLIDER_STEP) * SLIDER_STEP, 1)
+    return gui.add_slider(label, min(SLIDER_STEP, count, most), end, SLIDER_STEP, min(most, end))

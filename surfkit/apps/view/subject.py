@@ -11,16 +11,16 @@ import numpy as np
 import torch
 
 from surfkit.apps.render.path import up_of
-from surfkit.apps.texture.deliver import NAME
-from surfkit.apps.texture.make import RECORD
+from surfkit.apps.texture.deliver import TEXTURED_NAME
+from surfkit.apps.texture.make import TEXTURE_RECORD
 from surfkit.apps.view.display import by_height, height_bounds
-from surfkit.apps.view.mesh_files import MESHES, Textured, other_mesh, textured
+from surfkit.apps.view.mesh_files import MESH_SUFFIXES, TexturedGlb, other_mesh, textured
 from surfkit.compress.levels.tree import LodTree
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.las import CLOUDS, read_las
-from surfkit.evaluate.geometry.place import Y_UP, Z_UP, notes_in, own_notes, root_of
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.place import Y_AXIS, Z_AXIS, notes_in, own_notes, root_of
+from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
 from surfkit.io.datasets.sparse_ply import read_points
 from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.files import read_splat_file
@@ -28,7 +28,7 @@ from surfkit.io.splats.gltf_reader import UPS
 from surfkit.io.splats.models import refuse_unsound
 from surfkit.io.splats.table import SplatTable
 from surfkit.mesh.base import LENGTHS, VALUES, Mesh
-from surfkit.partition.plan import Plan
+from surfkit.partition.plan import PartitionPlan
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
@@ -42,15 +42,15 @@ from surfkit.runs.pipeline import loaded
 from surfkit.runs.resume import read_noting_changes
 from surfkit.scene.scene import Frame, Scene, View
 
-EXTENT = 0.9
+EXTENT_POINT_SHARE = 0.9
 """Share of the positions in a file that lies within the extent of its local frame."""
-MOST_POINTS = 10_000_000
+MAX_CLOUD_POINTS = 10_000_000
 """Points of a cloud that are kept; a click looks among these."""
 SPLATS_IN_GLTF = b"KHR_gaussian_splatting"
 
 
 @dataclass(frozen=True)
-class Points:
+class ViewerPoints:
     """A cloud: (N, 3) float32 local positions, and (N, 3) uint8 colours."""
 
     xyz: np.ndarray
@@ -58,7 +58,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Subject:
+class ViewerScene:
     """What there is to look at; anything may be missing but one of splats, mesh and points.
 
     Attributes:
@@ -80,12 +80,12 @@ class Subject:
     up: np.ndarray
     splats: SplatTable | None = None
     mesh: Mesh | None = None
-    points: Points | None = None
+    points: ViewerPoints | None = None
     scene: Scene | None = None
     draw: Callable[[View], Maps] | None = field(default=None, repr=False)
-    plan: Plan | None = None
+    plan: PartitionPlan | None = None
     levels: LodTree | None = None
-    textured: Textured | None = None
+    textured: TexturedGlb | None = None
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -100,7 +100,7 @@ class Subject:
 
 
 @contextmanager
-def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Iterator[Subject]:
+def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Iterator[ViewerScene]:
     """Within, what a run folder or a file holds.
 
     Args:
@@ -122,7 +122,7 @@ def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Ite
     yield of_file(path, device, axes)
 
 
-def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
+def of_run(ctx: RunContext, made: Reconstruction) -> ViewerScene:
     """What a finished run holds."""
     run, frame = ctx.run, ctx.scene.frame
     made, table, mesh = with_drawing(made, ctx.rasterizer), None, None
@@ -133,10 +133,10 @@ def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
     if run.mesh.exists() and run.mesh_record.exists():
         mesh = local_mesh(read_surface(run.mesh), frame)
     sparse = ctx.scene.cloud
-    points = Points(sparse.xyz.numpy(), sparse.rgb.numpy()) if len(sparse.xyz) else None
+    points = ViewerPoints(sparse.xyz.numpy(), sparse.rgb.numpy()) if len(sparse.xyz) else None
     if table is None and mesh is None and points is None:
         raise BadInput(f"{run.out}: it has neither splats nor a mesh nor points to look at")
-    return Subject(
+    return ViewerScene(
         path=run.out,
         frame=frame,
         up=up_of(ctx.scene),
@@ -151,11 +151,11 @@ def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
     )
 
 
-def textured_mesh(out: Path) -> Textured | None:
+def textured_mesh(out: Path) -> TexturedGlb | None:
     """What `surfkit texture` has made of the mesh of the run in a folder; None where it has not, or it is damaged."""
     folder = out / "texture"
-    path = folder / f"{NAME}.glb"
-    if not (path.exists() and (folder / RECORD).exists()):
+    path = folder / f"{TEXTURED_NAME}.glb"
+    if not (path.exists() and (folder / TEXTURE_RECORD).exists()):
         return None
     try:
         return textured(path, root_of(path))
@@ -164,17 +164,17 @@ def textured_mesh(out: Path) -> Textured | None:
         return None
 
 
-def of_file(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Subject:
+def of_file(path: Path, device: Device, axes: AxesOrAuto = "auto") -> ViewerScene:
     """What a file holds."""
     if path.suffix.lower() in CLOUDS:
-        xyz, rgb, notes = read_las(path, MOST_POINTS)
+        xyz, rgb, notes = read_las(path, MAX_CLOUD_POINTS)
         rgb = by_height(xyz[:, 2], height_bounds(xyz[:, 2])) if rgb is None else rgb
         frame = frame_of(xyz, notes)
-        return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
+        return ViewerScene(path, frame, Z_AXIS, points=ViewerPoints(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):
         return of_splats(path, device, axes)
-    pictures, up = None, Z_UP
-    if path.suffix.lower() in MESHES:
+    pictures, up = None, Z_AXIS
+    if path.suffix.lower() in MESH_SUFFIXES:
         surface, colors, place, pictures = other_mesh(path)
         notes, up = place.notes, place.up
     else:
@@ -182,16 +182,16 @@ def of_file(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Subject:
         colors = colors_of(surface)
     if surface.faces is not None:
         frame = frame_of(surface.vertices(), notes)
-        return Subject(path, frame, up, mesh=local_mesh(surface, frame, colors), textured=pictures)
-    if path.suffix.lower() in MESHES:
+        return ViewerScene(path, frame, up, mesh=local_mesh(surface, frame, colors), textured=pictures)
+    if path.suffix.lower() in MESH_SUFFIXES:
         xyz, rgb = surface.vertices(), np.full((len(surface), 3), 128, np.uint8) if colors is None else colors
     else:
         xyz, rgb = read_points(path)
     frame = frame_of(xyz, notes)
-    return Subject(path, frame, up, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
+    return ViewerScene(path, frame, up, points=ViewerPoints(frame.to_local(xyz).astype(np.float32), rgb))
 
 
-def of_splats(path: Path, device: Device, axes: AxesOrAuto) -> Subject:
+def of_splats(path: Path, device: Device, axes: AxesOrAuto) -> ViewerScene:
     """What a file of splats holds."""
     table = read_splat_file(path, axes)
     if not len(table):
@@ -203,7 +203,7 @@ def of_splats(path: Path, device: Device, axes: AxesOrAuto) -> Subject:
     primitive = primitive_of(local)
     model = SplatModel(primitive, primitive.from_table(local, torch.Generator()), local.sh_degree)
     made = with_drawing(Reconstruction(splats=model), select_rasterizer(device)[0])
-    return Subject(path, frame, up, splats=local, draw=made.draw)
+    return ViewerScene(path, frame, up, splats=local, draw=made.draw)
 
 
 def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
@@ -214,12 +214,12 @@ def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
     """
     notes = coordinates_of(path)
     if "crs" in notes:
-        return notes, Z_UP
+        return notes, Z_AXIS
     told = own_notes(root_of(path))
     if not told:
-        return notes, -Y_UP
+        return notes, -Y_AXIS
     unit = {"metres per unit": told.get("metres_per_unit"), "crs": told.get("crs")}
-    return {name: str(value) for name, value in unit.items() if value}, UPS[told["up"]].T @ Y_UP
+    return {name: str(value) for name, value in unit.items() if value}, UPS[told["up"]].T @ Y_AXIS
 
 
 def holds_splats(path: Path) -> bool:
@@ -229,7 +229,7 @@ def holds_splats(path: Path) -> bool:
         return b"\nelement chunk " in head or b" f_dc_0" in head
     if path.suffix.lower() in (".glb", ".gltf"):
         return SPLATS_IN_GLTF in head
-    return path.suffix.lower() not in MESHES
+    return path.suffix.lower() not in MESH_SUFFIXES
 
 
 def head_of(path: Path) -> bytes:
@@ -253,13 +253,13 @@ def frame_of(xyz: np.ndarray, notes: Mapping[str, str]) -> Frame:
         notes: From `coordinates_of`.
     """
     middle = np.median(xyz, axis=0)
-    extent = float(np.quantile(np.linalg.norm(xyz - middle, axis=1), EXTENT))
+    extent = float(np.quantile(np.linalg.norm(xyz - middle, axis=1), EXTENT_POINT_SHARE))
     shift = tuple(float(word) for word in notes.get("offset", "0 0 0").split())
     metres = float(notes["metres per unit"]) if "metres per unit" in notes else None
     return Frame(middle, 1 / extent if extent > 0 else 1.0, metres, notes.get("crs"), shift)  # type: ignore[arg-type]
 
 
-def local_mesh(surface: Surface, frame: Frame, colors: np.ndarray | None = None) -> Mesh:
+def local_mesh(surface: SurfaceFile, frame: Frame, colors: np.ndarray | None = None) -> Mesh:
     """The triangles of a file in a local frame."""
     vertices = frame.to_local(surface.vertices()).astype(np.float32)
     if colors is None:
@@ -267,13 +267,13 @@ def local_mesh(surface: Surface, frame: Frame, colors: np.ndarray | None = None)
     return Mesh(vertices, np.ascontiguousarray(surface.faces, np.int32), colors, values=values_of(surface, frame))
 
 
-def values_of(surface: Surface, frame: Frame) -> dict[str, np.ndarray]:
+def values_of(surface: SurfaceFile, frame: Frame) -> dict[str, np.ndarray]:
     """(V,) float32 values of the vertices of a PLY file by name, see `VALUES`; lengths in local units."""
     there = [name for name in VALUES if name in (surface.rows.dtype.names or ())]
     return {name: (surface.rows[name] * (frame.scale if name in LENGTHS else 1.0)).astype(np.float32) for name in there}
 
 
-def colors_of(surface: Surface) -> np.ndarray | None:
+def colors_of(surface: SurfaceFile) -> np.ndarray | None:
     """(V, 3) uint8 of the vertices of a PLY file; None where it has none."""
     names = ("red", "green", "blue")
     if surface.rows.dtype.names is None or not set(names) <= set(surface.rows.dtype.names):

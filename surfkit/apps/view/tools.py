@@ -19,28 +19,28 @@ from surfkit.apps.view.measure import coordinates, in_words, measured, path_line
 from surfkit.apps.view.picking import corners_of
 from surfkit.apps.view.plain import as_code, as_text
 from surfkit.apps.view.screen import WORLD, pose_of, stand_at, telling
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.core.check import BadInput
 from surfkit.scene.crop import Crop, write_crop
 
 if TYPE_CHECKING:
     import viser
 
-LINE, MARK = (230, 40, 40), (20, 120, 230)
-BOX = (20, 160, 60)
-DOT = 0.006
+MEASURE_COLOR, PATH_COLOR = (230, 40, 40), (20, 120, 230)
+BOX_COLOR = (20, 160, 60)
+MARK_SIZE = 0.006
 """Size of what is marked, local units at a distance of 1."""
-WITHIN = (5, 95)
+CROP_PERCENTILES = (5, 95)
 """Percentiles of the positions at the corners of a new crop box."""
 PREVIEW_S = 0.04
 """Between two steps of a preview."""
-WRITING = threading.Lock()
+WRITING_LOCK = threading.Lock()
 
 
-class Measure:
+class MeasureTool:
     """Coordinates of what is clicked, and lengths and areas of what was clicked one after the other."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle) -> None:
         """Build the panel."""
         self.shelf, self.client = shelf, client
         self.points: list[np.ndarray] = []
@@ -64,7 +64,7 @@ class Measure:
             return
         subject = self.shelf.subject
         self.place.content = as_text(coordinates(place, subject.frame, subject.up))
-        self._mark("/clicked", place, MARK)
+        self._mark("/clicked", place, PATH_COLOR)
         if self.on.value:
             self.points.append(place)
             self._draw()
@@ -88,10 +88,12 @@ class Measure:
         self.result.content = in_words(found, subject.frame, len(self.points))
         scene.add_frame("/measure", show_axes=False)
         for at, point in enumerate(self.points):
-            self._mark(f"/measure/{at}", point, LINE)
+            self._mark(f"/measure/{at}", point, MEASURE_COLOR)
         segments = path_lines(self.points, self.closed.value)
         if len(segments):
-            scene.add_line_segments("/measure/line", segments * WORLD, LINE, thickness=3, thickness_units="screen")
+            scene.add_line_segments(
+                "/measure/line", segments * WORLD, MEASURE_COLOR, thickness=3, thickness_units="screen"
+            )
         name = "m" if subject.frame.metres else "units"
         for at, (start, end) in enumerate(segments):
             text = f"{shown(float(np.linalg.norm(end - start)) * unit)} {name}"
@@ -99,20 +101,20 @@ class Measure:
 
     def _mark(self, name: str, place: np.ndarray, color: tuple[int, int, int]) -> None:
         away = float(np.linalg.norm(place - np.asarray(self.client.camera.position) / WORLD))
-        self.client.scene.add_icosphere(name, DOT * away * WORLD, color, position=place * WORLD)
+        self.client.scene.add_icosphere(name, MARK_SIZE * away * WORLD, color, position=place * WORLD)
 
 
 class CropTool:
     """A box with two corners to drag, written as a crop file in the frame of the data set."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, folder: Path) -> None:
         """Build the panel; files go into `folder`."""
         self.shelf, self.client, self.folder = shelf, client, folder
         subject = shelf.subject
         self.axis = upright_axis(subject.up)
         places = subject.positions()
         places = places[:: max(1, len(places) // 200_000)].astype(np.float64)
-        self.corners = [np.asarray(corner, np.float64) for corner in np.percentile(places, WITHIN, axis=0)]
+        self.corners = [np.asarray(corner, np.float64) for corner in np.percentile(places, CROP_PERCENTILES, axis=0)]
         gui = client.gui
         with gui.add_folder("Crop box", expand_by_default=False):
             self.on = gui.add_checkbox("show the box", False, hint="Drag the arrows of its two corners.")
@@ -152,14 +154,16 @@ class CropTool:
             return
         frame = self.shelf.subject.frame
         lines = frame.to_local(edges(self.crop)).astype(np.float32)
-        self.client.scene.add_line_segments("/crop/box", lines * WORLD, BOX, thickness=3, thickness_units="screen")
+        self.client.scene.add_line_segments(
+            "/crop/box", lines * WORLD, BOX_COLOR, thickness=3, thickness_units="screen"
+        )
         name, unit = ("m", frame.metres) if frame.metres else ("units", 1.0)
         first, second, height = (shown(size * unit) for size in sizes(self.crop))
         self.told.content = f"{first} × {second} {name} on the ground, {height} {name} high"
 
     def _write(self) -> None:
         path, source = free_name(self.folder, "crop"), self.shelf.subject.path
-        with WRITING:
+        with WRITING_LOCK:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_crop(path, self.crop)
         run = shlex.quote(str(source)) if source.is_dir() else "RUN"
@@ -171,7 +175,7 @@ class CropTool:
 class PathTool:
     """Key views of a path, its preview, and its file."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
+    def __init__(self, shelf: SharedCache, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
         """Build the panel; files go into `folder`, and a preview ends when the server is `closing`."""
         self.shelf, self.client, self.folder, self.closing = shelf, client, folder, closing
         self.poses: list[np.ndarray] = []
@@ -219,9 +223,9 @@ class PathTool:
         centres = np.stack([camera.centre.numpy() for camera in cameras])
         scene.add_frame("/path", show_axes=False)
         lines = path_lines(list(centres), closed=False)
-        scene.add_line_segments("/path/line", lines * WORLD, MARK, thickness=3, thickness_units="screen")
+        scene.add_line_segments("/path/line", lines * WORLD, PATH_COLOR, thickness=3, thickness_units="screen")
         frames = frustum_lines(*corners_of(cameras[::10], 0.05))
-        scene.add_line_segments("/path/frames", frames * WORLD, MARK, thickness=1, thickness_units="screen")
+        scene.add_line_segments("/path/frames", frames * WORLD, PATH_COLOR, thickness=1, thickness_units="screen")
 
     def _play(self) -> None:
         """Fly along the path, in the time that it takes; a second click stops it."""
@@ -249,7 +253,7 @@ class PathTool:
         keys = self.keys
         same = [pose.tolist() for pose in keys.poses], keys.seconds, keys.fps, keys.fov_degrees
         if self.saved is None or self.saved[0] != same or not self.saved[1].exists():
-            with WRITING:
+            with WRITING_LOCK:
                 path = free_name(self.folder, "path")
                 self.saved = same, path, write_path(path, keys, self.shelf.subject.frame)
         return self.saved[1:]

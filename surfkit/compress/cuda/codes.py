@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
-SOURCE = Source(Path(__file__).with_name("codes.cu"), is_exact=True)
-TILE = 128
+CODES_SOURCE = CudaSource(Path(__file__).with_name("codes.cu"), is_exact=True)
+TILE_VECTORS = 128
 """Vectors of a block of `approach`."""
-ROWS = 1 << 18
+VECTORS_PER_LAUNCH = 1 << 18
 """Vectors in one call, at most: below 0.1 s with 65,536 codes."""
 
 
@@ -29,14 +29,14 @@ class GpuSearch:
     """See `compress.nearest.Search`; makes no use of features."""
 
     def __init__(self, codebook: Tensor, device: torch.device, on: Kernels | None = None) -> None:
-        self.codebook, self.on = codebook.to(device), on or kernels(SOURCE, device)
+        self.codebook, self.on = codebook.to(device), on or kernels(CODES_SOURCE, device)
         self.none = torch.empty(0, dtype=torch.int32, device=device)
         terms = codebook.shape[1] + 8
         self.bounds = 1 + 2 * terms * 2.0**-24, terms * 2.0**-125  # of rounding errors, as in cpu/nearest.cpp
 
     def parts(self, rows: int) -> Iterator[slice]:
         """See `Search.parts`."""
-        return (slice(at, min(rows, at + ROWS)) for at in range(0, rows, ROWS))
+        return (slice(at, min(rows, at + VECTORS_PER_LAUNCH)) for at in range(0, rows, VECTORS_PER_LAUNCH))
 
     def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """See `Search.nearest`; vectors and results are on the GPU."""
@@ -44,7 +44,7 @@ class GpuSearch:
         found, index = torch.empty(2, len(vectors), dtype=torch.int32, device=vectors.device).unbind()
         distance = torch.empty(len(vectors), device=vectors.device)
         given = vectors, self.codebook, vectors.shape[1], len(self.codebook), left_out
-        self.on.launch("approach", -(-len(vectors) // TILE), 256, *given, *self.bounds, found)
+        self.on.launch("approach", -(-len(vectors) // TILE_VECTORS), 256, *given, *self.bounds, found)
         self.on.launch("settle", -(-len(vectors) // 8), 256, *given, found, index, distance)
         return index, distance
 
@@ -62,6 +62,6 @@ def sums(vectors: Tensor, weights: Tensor, index: Tensor, codes: int, on: Kernel
     ordered, order = index.sort(stable=True)
     offsets = torch.searchsorted(ordered, torch.arange(codes + 1, dtype=torch.int32, device=index.device))
     total = torch.empty(codes, vectors.shape[1] + 1, dtype=torch.float64, device=index.device)
-    on = on or kernels(SOURCE, vectors.device)
+    on = on or kernels(CODES_SOURCE, vectors.device)
     on.launch("sum_by_code", codes, 64, vectors, weights, order, offsets, vectors.shape[1], total)
     return total

@@ -9,20 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from surfkit.compress.levels.pairs import Alike, summed
+from surfkit.compress.levels.pairs import MergeCost, summed
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.init import SH_C0
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import ALPHA_MAX, KINDS, Splats
+from surfkit.raster.api import ALPHA_MAX, PRIMITIVE_KINDS, Splats
 from surfkit.scene.rotations import numpy_quaternions, numpy_rotations
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 
 SHAPE = ("means", "quats", "scales", "opacities")
 """Columns that are merged as a shape; all others become weighted means."""
-THINNEST = 1e-7
+MIN_MERGED_SCALE = 1e-7
 """Smallest scale of what is merged, local units: a row of discs has no width."""
 
 
@@ -43,10 +43,12 @@ def refuse_unmergeable(primitive: Primitive) -> None:
             f"{lacking[0]} is not so; {remedy}"
         )
     places = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.4]])
-    params = primitive.init(Cloud(places, torch.full((4, 3), 128, dtype=torch.uint8)), torch.Generator().manual_seed(0))
+    params = primitive.init(
+        SparsePoints(places, torch.full((4, 3), 128, dtype=torch.uint8)), torch.Generator().manual_seed(0)
+    )
     splats = primitive.activate(params, 0)
-    if splats.kind not in KINDS:
-        raise BadInput(f"{complaint}: they are {splats.kind}s, and not {' or '.join(KINDS)}s; {remedy}")
+    if splats.kind not in PRIMITIVE_KINDS:
+        raise BadInput(f"{complaint}: they are {splats.kind}s, and not {' or '.join(PRIMITIVE_KINDS)}s; {remedy}")
     for name in SHAPE:
         value, drawn = columns[name].activation.value(params[name]), getattr(splats, name)
         drawn = drawn[:, : value.shape[1]] if value.dim() > 1 else drawn
@@ -99,7 +101,7 @@ class Shapes:
         thin = np.argsort(self.scales, axis=1)
         ordered = np.take_along_axis(self.scales, thin, axis=1)
         axis = np.take_along_axis(self.turns, thin[:, None, :1], axis=2)[..., 0]
-        return axis * (1 - ordered[:, :1] / np.maximum(ordered[:, 1:2], THINNEST))
+        return axis * (1 - ordered[:, :1] / np.maximum(ordered[:, 1:2], MIN_MERGED_SCALE))
 
     def merged(self, labels: np.ndarray, weights: np.ndarray, flat: bool) -> Shapes:
         """One for each group, with the axes from the longest to the shortest.
@@ -121,7 +123,7 @@ class Shapes:
         values, axes = np.linalg.eigh(summed(spread * weights[:, None, None], labels) / total[:, None, None])
         axes = axes[:, :, ::-1].copy()
         axes[np.linalg.det(axes) < 0, :, 2] *= -1
-        scales = np.sqrt(np.maximum(values[:, ::-1], THINNEST**2))
+        scales = np.sqrt(np.maximum(values[:, ::-1], MIN_MERGED_SCALE**2))
         if flat:
             scales[:, 2] = 0
         made = Shapes(means, axes, scales, np.ones(len(means)))
@@ -175,8 +177,8 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def alike(splats: Splats, weights: np.ndarray) -> Alike:
+def alike(splats: Splats, weights: np.ndarray) -> MergeCost:
     """What tells which splats are alike."""
     shapes = Shapes.of(splats)
     colors = 0.5 + SH_C0 * splats.sh[:, 0].detach().double().cpu().numpy()
-    return Alike(shapes.means, weights, colors, shapes.normals)
+    return MergeCost(shapes.means, weights, colors, shapes.normals)

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEIGHBOURS = 8
+PAIR_NEIGHBOURS = 8
 """Splats that each may be paired with."""
-PER_SPACING = 0.01
+SPACING_COST = 0.01
 """Cost of lying apart by the median distance of nearest neighbours, squared, where 1 is that of black and white."""
-PER_TURN = 0.1
+TURN_COST = 0.1
 """Cost of flat splats that lie at right angles."""
-SMALLEST = 1e-20
+MIN_SQUARED_SPACING = 1e-20
 """Squared length, where neighbours lie in one place."""
 
 
 @dataclass(frozen=True)
-class Alike:
+class MergeCost:
     """What tells which of N splats are near and alike, all float64.
 
     Attributes:
@@ -40,16 +40,16 @@ class Alike:
 
         Args:
             i, j: (E,) positions.
-            spacing: Squared length that `PER_SPACING` is about.
+            spacing: Squared length that `SPACING_COST` is about.
         """
         apart = ((self.means[i] - self.means[j]) ** 2).sum(1) / spacing
         other = ((self.colors[i] - self.colors[j]) ** 2).sum(1)
         lengths = np.linalg.norm(self.normals[i], axis=1) * np.linalg.norm(self.normals[j], axis=1)
         turned = lengths - np.abs((self.normals[i] * self.normals[j]).sum(1))
         weight = self.weights[i] * self.weights[j] / (self.weights[i] + self.weights[j])
-        return weight * (PER_SPACING * apart + other + PER_TURN * turned)
+        return weight * (SPACING_COST * apart + other + TURN_COST * turned)
 
-    def merged(self, labels: np.ndarray, partner: np.ndarray) -> Alike:
+    def merged(self, labels: np.ndarray, partner: np.ndarray) -> MergeCost:
         """The same of groups; `partner` (N,) is the position of the first of each splat's group."""
         total = summed(self.weights, labels)
         sign = np.where((self.normals * self.normals[partner]).sum(1) < 0, -1.0, 1.0)
@@ -57,7 +57,7 @@ class Alike:
         def mean(values: np.ndarray) -> np.ndarray:
             return summed(values * self.weights[:, None], labels) / total[:, None]
 
-        return Alike(mean(self.means), total, mean(self.colors), mean(self.normals * sign[:, None]))
+        return MergeCost(mean(self.means), total, mean(self.colors), mean(self.normals * sign[:, None]))
 
 
 def summed(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def summed(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.add.reduceat(values[order], starts, axis=0)
 
 
-def groups(alike: Alike, target: int) -> np.ndarray:
+def groups(alike: MergeCost, target: int) -> np.ndarray:
     """(N,) labels 0..target-1 of N splats that become `target`: those that lose least are merged first.
 
     In each round every splat that is its best partner's best partner is merged with it, so that the result depends on
@@ -77,7 +77,7 @@ def groups(alike: Alike, target: int) -> np.ndarray:
     spacing = None
     while len(alike) > target:
         low, high, squared = _edges(alike.means)
-        spacing = spacing or max(float(np.median(squared)), SMALLEST)
+        spacing = spacing or max(float(np.median(squared)), MIN_SQUARED_SPACING)
         cost = alike.cost(low, high, spacing)
         rank = np.empty(len(low), np.int64)
         rank[np.lexsort((high, low, cost))] = np.arange(len(low))
@@ -97,7 +97,7 @@ def _edges(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of neighbours, lower position first, each once, and (N,) squared distances to the nearest other place."""
     from scipy.spatial import cKDTree
 
-    count = min(NEIGHBOURS + 1, len(means))
+    count = min(PAIR_NEIGHBOURS + 1, len(means))
     distances, found = cKDTree(means).query(means, k=count)
     here = np.repeat(np.arange(len(means)), count)
     there = found.reshape(-1)

@@ -29,9 +29,9 @@ from surfkit.train.stage import Stage
 from surfkit.train.trainer import Trainer
 from surfkit.train.views import ViewContributions
 
-SMALLEST_PX = 32
+MIN_PICTURE_SIDE_PX = 32
 """Shorter side of the pictures that a level is refined on, at least, where the photographs have as much."""
-FALLS_TO = 0.1
+FINAL_RATE_SHARE = 0.1
 """Learning rates fall to this share of themselves."""
 
 
@@ -83,7 +83,7 @@ def seen_from_afar(view: View, smaller: float) -> View:
     """A view with a picture that is so many times smaller, but not smaller than SMALLEST_PX."""
     camera = view.camera
     shorter = min(camera.width, camera.height)
-    by = min(smaller, max(1.0, shorter / SMALLEST_PX))
+    by = min(smaller, max(1.0, shorter / MIN_PICTURE_SIDE_PX))
     return replace(view, camera=camera.resized(max(1, round(camera.width / by)), max(1, round(camera.height / by))))
 
 
@@ -111,7 +111,10 @@ def _optimised(
     """Raw parameters after the steps, on the CPU."""
     primitive = level.primitive
     starts = {name: column.rate.start for name, column in primitive.columns().items()}
-    rates = {name: LearningRate(rate, FALLS_TO * rate) if rate else LearningRate(0.0) for name, rate in starts.items()}
+    rates = {
+        name: LearningRate(rate, FINAL_RATE_SHARE * rate) if rate else LearningRate(0.0)
+        for name, rate in starts.items()
+    }
     rates |= {"means": RATES["means"]} if "means" in rates else {}
     stage = Stage(steps=steps, densify=None, rates=rates, near=level.near)
     trainer = Trainer(stage, primitive, views, pictures, given.rasterizer, expect=pictures.expect)

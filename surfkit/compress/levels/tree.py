@@ -15,7 +15,7 @@ from surfkit.raster.api import CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
-MARGIN_PX = 3.0
+BLOCK_MARGIN_PX = 3.0
 """Around an image when blocks outside are left out: splats smaller than a pixel are drawn with up to this radius."""
 
 
@@ -86,7 +86,7 @@ class LodBlocks:
         found = local[:, 2] + extent <= near
         sides = (0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)
         for axis, focal, centre, size in sides:
-            for sign, edge in ((1.0, -MARGIN_PX), (-1.0, size + MARGIN_PX)):
+            for sign, edge in ((1.0, -BLOCK_MARGIN_PX), (-1.0, size + BLOCK_MARGIN_PX)):
                 normal = np.zeros(3)  # of the plane through the camera centre and that edge, inwards
                 normal[axis], normal[2] = sign, -sign * (edge - centre) / focal
                 normal /= np.linalg.norm(normal)

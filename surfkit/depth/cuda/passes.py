@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.depth.native import Grey, Planes, Terms, gains, pattern, way
+from surfkit.depth.native import GreyImage, MatchingSettings, Planes, gains, pattern, way
 from surfkit.raster.native import module
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.scene.camera import Camera
 
-WIDE, HIGH = 32, 4
+BLOCK_WIDTH, BLOCK_HEIGHT = 32, 4
 """Pixels of one colour that a block of threads takes: on so many columns of that colour, and rows."""
 
 
-class View(ctypes.Structure):
-    """`View` of patch_match.cu."""
+class PatchMatchView(ctypes.Structure):
+    """`PatchMatchView` of patch_match.cu."""
 
     _fields_ = (
         ("first", ctypes.c_longlong),
@@ -37,8 +37,8 @@ class View(ctypes.Structure):
     )
 
 
-class Job(ctypes.Structure):
-    """`Job` of patch_match.cu."""
+class PatchMatchJob(ctypes.Structure):
+    """`PatchMatchJob` of patch_match.cu."""
 
     _fields_ = (
         ("size", ctypes.c_int * 2),
@@ -52,11 +52,11 @@ class Job(ctypes.Structure):
     )
 
 
-SOURCES = {
-    samples: Source(
+SOURCE_BY_SAMPLES = {
+    samples: CudaSource(
         Path(__file__).with_name("patch_match.cu"),
         defines={"SAMPLES": samples, "BLOCKS": blocks},
-        structures={"View": View, "Job": Job},
+        structures={"View": PatchMatchView, "Job": PatchMatchJob},
     )
     for samples, blocks in ((16, 4), (32, 3))
 }
@@ -71,21 +71,21 @@ class GpuPasses:
         load: Gives the kernels of a source; by default those for the device.
     """
 
-    def __init__(self, device: torch.device, load: Callable[[Source], Kernels] | None = None) -> None:
+    def __init__(self, device: torch.device, load: Callable[[CudaSource], Kernels] | None = None) -> None:
         self.device, self.load = device, load or (lambda source: kernels(source, device))
-        self.uploaded: WeakKeyDictionary[Grey, Tensor] = WeakKeyDictionary()
+        self.uploaded: WeakKeyDictionary[GreyImage, Tensor] = WeakKeyDictionary()
 
     def improve(
         self,
-        here: Grey,
-        others: Sequence[Grey],
+        here: GreyImage,
+        others: Sequence[GreyImage],
         planes: Planes,
-        terms: Terms,
+        terms: MatchingSettings,
         seed: int,
         known: Sequence[Tensor | None] | None = None,
     ) -> None:
         """See `depth.native.improve`; the same bits twice on one GPU."""
-        on = self.load(SOURCES[terms.samples])
+        on = self.load(SOURCE_BY_SAMPLES[terms.samples])
         pictures = [self.picture(other) for other in others]
         nothing = torch.empty(0, 0, device=self.device)
         maps = [nothing if found is None else found.to(self.device) for found in known or [None] * len(others)]
@@ -93,14 +93,14 @@ class GpuPasses:
         given = self.picture(here), joined(pictures), joined(maps)
         state = [self.uploads(part) for part in (planes.value, planes.cost, planes.each)]
         height, width = planes.cost.shape
-        grid = -(-width // (2 * WIDE)), -(-height // HIGH)
+        grid = -(-width // (2 * BLOCK_WIDTH)), -(-height // BLOCK_HEIGHT)
         job = job_of(here.camera, len(others), terms, seed)
         for colour in (0, 1):
-            on.launch("improve", grid, WIDE * HIGH, job, colour, views, *given, *state)
+            on.launch("improve", grid, BLOCK_WIDTH * BLOCK_HEIGHT, job, colour, views, *given, *state)
         for part, found in zip((planes.value, planes.cost, planes.each), state, strict=True):
             part[:] = found.cpu().numpy()
 
-    def picture(self, grey: Grey) -> Tensor:
+    def picture(self, grey: GreyImage) -> Tensor:
         """Four grey values in one number for each pixel, on the GPU, as long as it is kept here."""
         if grey not in self.uploaded:
             self.uploaded[grey] = self.uploads(in_fours(grey.value).view(np.int32))
@@ -115,7 +115,7 @@ def in_fours(value: np.ndarray) -> np.ndarray:
     """(H + 2 b, W + 2 b) uint32: a pixel, and those to the right, below, and below to the right, for interpolation.
 
     Continued by a border of b pixels. A GPU reads four bytes at once only where they are aligned, unlike a CPU
-    (`Grey.in_pairs`).
+    (`GreyImage.in_pairs`).
     """
     border = module().STEREO_BORDER
     wide = np.pad(value, (border, border + 1), mode="edge").astype(np.uint32)
@@ -128,11 +128,11 @@ def joined(parts: Sequence[Tensor]) -> Tensor:
 
 
 def views_of(
-    here: Grey, others: Sequence[Grey], planes: Planes, pictures: Sequence[Tensor], maps: Sequence[Tensor]
+    here: GreyImage, others: Sequence[GreyImage], planes: Planes, pictures: Sequence[Tensor], maps: Sequence[Tensor]
 ) -> ctypes.Array:
-    """A `View` for each picture to compare with, of those that are joined."""
+    """A `PatchMatchView` for each picture to compare with, of those that are joined."""
     border = module().STEREO_BORDER
-    made = (View * len(others))()
+    made = (PatchMatchView * len(others))()
     first = first_inverse = 0
     bright = gains(here, others, planes)
     for view, other, gain, picture, inverse in zip(made, others, bright, pictures, maps, strict=True):
@@ -146,13 +146,13 @@ def views_of(
     return made
 
 
-def job_of(camera: Camera, views: int, terms: Terms, seed: int) -> Job:
+def job_of(camera: Camera, views: int, terms: MatchingSettings, seed: int) -> PatchMatchJob:
     """What a pass is told of one picture."""
     offsets = pattern(terms.window)
     most = max(1.0, float(np.abs(offsets[:2]).max()))
     parallax = terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency
     numbers = terms.low, terms.high, *parallax, terms.spread, terms.brightness
-    return Job(
+    return PatchMatchJob(
         (camera.width, camera.height),
         (views, terms.best),
         terms.survey,

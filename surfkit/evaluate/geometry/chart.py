@@ -11,13 +11,13 @@ import numpy as np
 from surfkit.core.check import printable
 from surfkit.core.files import replacing
 
-INCHES, DPI = (9.0, 5.6), 100
+CHART_INCHES, CHART_DPI = (9.0, 5.6), 100
 LEGEND_LETTERS = 90
 """Room for the names of the lines in one row."""
 
 
 @dataclass(frozen=True)
-class Line:
+class PlotLine:
     """One line of a chart.
 
     Attributes:
@@ -36,7 +36,12 @@ class Line:
 
 
 def write_lines(
-    path: Path, lines: Sequence[Line], title: str, x_label: str, top: float | None = None, mark: tuple[str, float] = ()
+    path: Path,
+    lines: Sequence[PlotLine],
+    title: str,
+    x_label: str,
+    top: float | None = None,
+    mark: tuple[str, float] = (),
 ) -> None:
     """Save a chart of lines as PNG; both axes begin with 0.
 
@@ -54,7 +59,7 @@ def write_lines(
 
     style = {**matplotlib.rcParamsDefault, "text.parse_math": False}  # names may have dollar signs
     with matplotlib.rc_context({name: style[name] for name in style if name != "backend"}):  # not the user's own style
-        figure = Figure(INCHES, DPI, layout="constrained")
+        figure = Figure(CHART_INCHES, CHART_DPI, layout="constrained")
         axes = figure.add_subplot(title=printable(title), xlabel=x_label)
         drawn = [axes.plot(line.x, line.y, color=line.color, linewidth=line.width)[0] for line in lines]
         axes.set_xlim(0, max(float(line.x.max()) for line in lines) or 1)
@@ -87,8 +92,8 @@ def write_chart(path: Path, taus: np.ndarray, values: np.ndarray, tau: float, ti
     total = values.sum(1)
     f1 = np.divide(2 * values.prod(1), total, out=np.zeros_like(total), where=total > 0)
     lines = [
-        Line("F1", taus, f1, "0.75", 3),
-        Line("precision", taus, values[:, 0], "tab:blue"),
-        Line("recall", taus, values[:, 1], "tab:orange"),
+        PlotLine("F1", taus, f1, "0.75", 3),
+        PlotLine("precision", taus, values[:, 0], "tab:blue"),
+        PlotLine("recall", taus, values[:, 1], "tab:orange"),
     ]
     write_lines(path, lines, title, "distance", top=1.0, mark=("tau", tau))

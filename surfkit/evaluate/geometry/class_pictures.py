@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.events import FileWritten, emit
-from surfkit.evaluate.geometry.classes import Classes, Group
-from surfkit.evaluate.geometry.comparison import Outcome
-from surfkit.evaluate.geometry.errors import LONGEST_PX, draw_from_view, error_colors, write_plan, write_row
+from surfkit.evaluate.geometry.classes import Classes, PointClassification
+from surfkit.evaluate.geometry.comparison import ComparisonResult
+from surfkit.evaluate.geometry.errors import PICTURE_LONGEST_PX, draw_from_view, error_colors, write_plan, write_row
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.visibility import project
 from surfkit.scene.scene import Frame, View
 
-OTHERS = np.array([232, 232, 232], np.uint8)
+OTHER_COLOR = np.array([232, 232, 232], np.uint8)
 """Colour of points of other classes."""
 DRAWN_FROM_VIEWS = {("surface", "facade"), ("edges", "near"), ("edges", "away")}
 """Classes that are drawn as a training view sees them: from above they are lines."""
@@ -26,7 +26,7 @@ CHOOSING_POINTS = 20_000
 
 
 def write_classes(
-    out: Path, outcome: Outcome, classes: Classes, views: Sequence[View] = (), frame: Frame | None = None
+    out: Path, outcome: ComparisonResult, classes: Classes, views: Sequence[View] = (), frame: Frame | None = None
 ) -> None:
     """Write `class-GROUP-NAME.png` for each class that has points: both clouds, from above or as a view sees them.
 
@@ -45,7 +45,7 @@ def write_classes(
             if not (chosen[0].any() or chosen[1].any()):
                 continue
             captions = [f"{what}: {_caption(group, name)}" for what in ("reconstruction", "truth")]
-            shown = [np.where(which[:, None], color, OTHERS) for which, color in zip(chosen, colors, strict=True)]
+            shown = [np.where(which[:, None], color, OTHER_COLOR) for which, color in zip(chosen, colors, strict=True)]
             path = out / f"class-{group.name}-{name.replace(' ', '-')}.png"
             parts = list(zip(captions, (draw.reconstruction, draw.truth), shown, strict=True))
             if (group.name, name) in DRAWN_FROM_VIEWS and views and frame is not None:
@@ -55,7 +55,7 @@ def write_classes(
             emit(FileWritten(path, "geometry"))
 
 
-def _caption(group: Group, name: str) -> str:
+def _caption(group: PointClassification, name: str) -> str:
     """What a class is, under a picture."""
     texts = {
         "surface": name,
@@ -69,7 +69,7 @@ def _caption(group: Group, name: str) -> str:
 def _write_view(
     path: Path,
     parts: list[tuple[str, np.ndarray, np.ndarray]],
-    outcome: Outcome,
+    outcome: ComparisonResult,
     chosen: tuple[np.ndarray, np.ndarray],
     scene: tuple[Sequence[View], Frame],
 ) -> None:
@@ -80,7 +80,7 @@ def _write_view(
     points = parts[1][1][chosen[1]] if chosen[1].any() else parts[0][1][chosen[0]]
     few = apply(back, points[:: max(1, len(points) // CHOOSING_POINTS)])
     count = min(CANDIDATE_VIEWS, len(views))
-    some = [views[(2 * i + 1) * len(views) // (2 * count)].camera.sized(LONGEST_PX) for i in range(count)]
+    some = [views[(2 * i + 1) * len(views) // (2 * count)].camera.sized(PICTURE_LONGEST_PX) for i in range(count)]
     camera = max(some, key=lambda one: len(project(few, one, frame.input_pose(one.world_to_camera))[0]))
     pose = frame.input_pose(camera.world_to_camera)
     images = [draw_from_view(camera, pose, apply(back, cloud), colors, gap) for _, cloud, colors in parts]

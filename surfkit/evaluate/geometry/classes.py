@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.evaluate.geometry.comparison import Comparison, Outcome
+from surfkit.evaluate.geometry.comparison import Comparison, ComparisonResult
 from surfkit.evaluate.geometry.normals import normals_at
-from surfkit.evaluate.geometry.repetition import LEAST, Draw
+from surfkit.evaluate.geometry.repetition import MIN_COMPARED_POINTS, RepetitionResult
 from surfkit.evaluate.geometry.scores import nearest_rows, surface_gap, tree
 from surfkit.evaluate.geometry.sightings import Sightings, sightings
 from surfkit.evaluate.geometry.terrain import Terrain, terrain
@@ -20,24 +20,24 @@ from surfkit.evaluate.images.seams import Seams
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import Up, up_direction
 
-REACH = 5.0
+REACH_TAUS = 5.0
 """Multiples of tau within which a point of the reconstruction has the class of the nearest point of the truth."""
 FOR_VIEWS = 400_000
 """Points of the truth that views are counted for, about; larger clouds are thinned to that, and the nearest counts."""
 LEVEL_COSINE = 0.5
 """Cosine between up and a normal, above which a surface is a roof or ground: up to 60 degrees steep."""
-NONE = -1
+NO_CLASS = -1
 """Class of a point that belongs to none."""
-SURFACES = ("roof", "facade", "ground")
-VIEWS = ("0", "1", "2", "3-5", "6 or more")
+SURFACE_CLASSES = ("roof", "facade", "ground")
+VIEW_CLASSES = ("0", "1", "2", "3-5", "6 or more")
 SEEN_FROM = (0, 1, 2, 3, 6)
 """Views that a point of each class is seen by, or more."""
-EDGES = ("near", "away")
-SEAMS = ("near", "elsewhere")
+EDGE_CLASSES = ("near", "away")
+SEAM_CLASSES = ("near", "elsewhere")
 
 
 @dataclass(frozen=True)
-class Group:
+class PointClassification:
     """One way to tell points apart.
 
     Attributes:
@@ -64,14 +64,14 @@ class Classes:
         seams: Near borders of blocks, or None.
     """
 
-    groups: tuple[Group, ...]
+    groups: tuple[PointClassification, ...]
     up: Up
     ground: Terrain | None
     seams: Seams | None
 
 
 def classify(
-    outcome: Outcome,
+    outcome: ComparisonResult,
     settings: Comparison,
     views: Sequence[View] = (),
     frame: Frame | None = None,
@@ -99,8 +99,8 @@ def classify(
     """
     draw, tau = outcome.draws[0], outcome.tau
     back = np.linalg.inv(draw.alignment.matrix)
-    near = draw.distances.to_truth <= REACH * tau
-    partner = np.full(len(draw.reconstruction), NONE)
+    near = draw.distances.to_truth <= REACH_TAUS * tau
+    partner = np.full(len(draw.reconstruction), NO_CLASS)
     partner[near] = nearest_rows(tree(draw.truth), draw.reconstruction[near])
     far = np.flatnonzero(~near)
     up = up_direction(settings.up, views, frame, draw.alignment.matrix)
@@ -121,8 +121,8 @@ def _reconstruction_classes(truth: np.ndarray, own: np.ndarray, partner: np.ndar
 
 
 def _surfaces(
-    outcome: Outcome, up: Up, partner: np.ndarray, far: np.ndarray, random: np.random.Generator
-) -> tuple[Group, Terrain | None]:
+    outcome: ComparisonResult, up: Up, partner: np.ndarray, far: np.ndarray, random: np.random.Generator
+) -> tuple[PointClassification, Terrain | None]:
     draw = outcome.draws[0]
     ours, theirs = outcome.sides
     matrix = draw.alignment.matrix
@@ -133,21 +133,23 @@ def _surfaces(
     normals = normals_at(ours, apply(back, places), apply(back, draw.reconstruction), random)
     own_level = np.abs(normals @ (matrix[:3, :3] / scale_of(matrix)).T @ up.direction) > LEVEL_COSINE
     truth, own = _named(draw.truth, level, ground), _named(places, own_level, ground)
-    return Group("surface", SURFACES, _reconstruction_classes(truth, own, partner, far), truth), ground
+    return PointClassification(
+        "surface", SURFACE_CLASSES, _reconstruction_classes(truth, own, partner, far), truth
+    ), ground
 
 
 def _named(points: np.ndarray, level: np.ndarray, ground: Terrain | None) -> np.ndarray:
     """(n,) int8 classes of points whose surface is level, or not."""
     roof, facade, low = range(3)
     if ground is None:
-        return np.where(level, NONE, facade).astype(np.int8)
+        return np.where(level, NO_CLASS, facade).astype(np.int8)
     high = ground.above(points) > ground.clearance
     return np.where(~level, facade, np.where(high, roof, low)).astype(np.int8)
 
 
 def _by_views(
-    draw: Draw, scene: tuple[Sequence[View], Frame], partner: np.ndarray, far: np.ndarray, tau: float
-) -> list[Group]:
+    draw: RepetitionResult, scene: tuple[Sequence[View], Frame], partner: np.ndarray, far: np.ndarray, tau: float
+) -> list[PointClassification]:
     back, fewer = np.linalg.inv(draw.alignment.matrix), draw.truth
     if len(fewer) > FOR_VIEWS:
         fewer = thin([fewer], tau / 2 * np.sqrt(len(fewer) / FOR_VIEWS), fewer[0])
@@ -163,24 +165,24 @@ def _by_views(
 
     def by_edge(of: Sightings) -> np.ndarray:
         near = 2 * of.edges >= of.seen
-        return np.where(of.seen == 0, NONE, np.where(near, 0, 1)).astype(np.int8)
+        return np.where(of.seen == 0, NO_CLASS, np.where(near, 0, 1)).astype(np.int8)
 
     groups = []
-    for name, classes, class_of in (("views", VIEWS, by_number), ("edges", EDGES, by_edge)):
+    for name, classes, class_of in (("views", VIEW_CLASSES, by_number), ("edges", EDGE_CLASSES, by_edge)):
         truth, own = map(class_of, found)
-        groups.append(Group(name, classes, _reconstruction_classes(truth, own, partner, far), truth))
+        groups.append(PointClassification(name, classes, _reconstruction_classes(truth, own, partner, far), truth))
     return groups
 
 
-def _by_seams(draw: Draw, back: np.ndarray, frame: Frame, seams: Seams) -> Group:
+def _by_seams(draw: RepetitionResult, back: np.ndarray, frame: Frame, seams: Seams) -> PointClassification:
     ours, truth = (
         np.where(seams.near(frame.to_local(apply(back, points))), 0, 1).astype(np.int8)
         for points in (draw.reconstruction, draw.truth)
     )
-    return Group("seams", SEAMS, ours, truth)
+    return PointClassification("seams", SEAM_CLASSES, ours, truth)
 
 
-def class_figures(classes: Classes, draw: Draw, tau: float) -> dict[str, Any]:
+def class_figures(classes: Classes, draw: RepetitionResult, tau: float) -> dict[str, Any]:
     """Plain data: precision, recall and F1 of each class, and the points that these are shares of.
 
     A figure of fewer than 10 points is None.
@@ -189,7 +191,7 @@ def class_figures(classes: Classes, draw: Draw, tau: float) -> dict[str, Any]:
     return {
         "up": classes.up.direction.tolist(),
         "up_from": classes.up.source,
-        "reach": REACH * tau,
+        "reach": REACH_TAUS * tau,
         "ground": ground and {"cell": ground.cell, "clearance": ground.clearance},
         **({"seams_distance": seams.distance} if seams else {}),
         **{
@@ -199,10 +201,10 @@ def class_figures(classes: Classes, draw: Draw, tau: float) -> dict[str, Any]:
     }
 
 
-def _figures(group: Group, number: int, draw: Draw, tau: float) -> dict[str, Any]:
+def _figures(group: PointClassification, number: int, draw: RepetitionResult, tau: float) -> dict[str, Any]:
     right = (draw.distances.to_truth < tau)[group.ours == number]
     there = (draw.distances.to_reconstruction < tau)[group.truth == number]
-    precision, recall = (float(part.mean()) if len(part) >= LEAST else None for part in (right, there))
+    precision, recall = (float(part.mean()) if len(part) >= MIN_COMPARED_POINTS else None for part in (right, there))
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0

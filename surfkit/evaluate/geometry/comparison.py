@@ -13,20 +13,20 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.evaluate.geometry.presets import PRESETS, PresetName
-from surfkit.evaluate.geometry.registration import ROUNDS
+from surfkit.evaluate.geometry.registration import ICP_ROUNDS
 from surfkit.evaluate.geometry.repetition import (
-    LEAST,
+    MIN_COMPARED_POINTS,
     Box,
-    Draw,
+    ComparedSurface,
     Measurement,
-    Side,
+    RepetitionResult,
     cloud_side,
     mesh_side,
     refuse_few,
     warn_if_sparse,
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, read_transform, scale_of
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
 from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
@@ -34,22 +34,22 @@ from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5
 """Of the mean distance between neighbours in the truth (CityGaussianV2)."""
-OFF, FAR_OFF = 2.0, 10.0
+SUSPECT_MISS_TAUS, CERTAIN_MISS_TAUS = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
-SHARE, ENOUGH = 0.05, 5
+MIN_VIEW_SHARE, SUFFICIENT_VIEWS = 0.05, 5
 """Of the training views, that must see a point of the truth by default; and the number that is enough in any case: how
 many photographs show a place depends on their overlap, not on the size of the survey."""
-RESIZED = 0.02
+MAX_SCALE_CHANGE = 0.02
 """Change of scale by ICP above which a warning is printed."""
-LOSS = 0.002
+MAX_F1_LOSS = 0.002
 """Of F1 by alignment, above which a warning is printed; less is chance."""
-SHORTEST, FURTHEST = 1e-7, 1e4
+MIN_LENGTH_SHARE, MAX_LENGTH_SHARE = 1e-7, 1e4
 """Lengths that can be meant, as shares of the diagonal of the truth."""
-MOST_DRAWS = 1000
+MAX_DRAWS = 1000
 """Repetitions: the error bars are known long before."""
 
 Align = Literal["similarity", "rigid", "none"]
-WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
+ALIGNMENTS: tuple[Align, ...] = ("none", "rigid", "similarity")
 
 
 @dataclass(frozen=True)
@@ -117,10 +117,10 @@ class Comparison:
                 raise BadInput(f"--{name} {value:g}: it is a length, so it must be more than 0")
         if self.seed < 0:
             raise BadInput(f"--seed {self.seed}: give 0 or more")
-        if not 1 <= self.draws <= MOST_DRAWS:
-            raise BadInput(f"--draws {self.draws}: give 1 to {MOST_DRAWS}")
-        if self.samples is not None and self.samples < LEAST:
-            raise BadInput(f"--samples {self.samples}: give {LEAST} or more points")
+        if not 1 <= self.draws <= MAX_DRAWS:
+            raise BadInput(f"--draws {self.draws}: give 1 to {MAX_DRAWS}")
+        if self.samples is not None and self.samples < MIN_COMPARED_POINTS:
+            raise BadInput(f"--samples {self.samples}: give {MIN_COMPARED_POINTS} or more points")
         if self.visible is not None and not (0 < self.visible <= 1 or (self.visible > 1 and self.visible % 1 == 0)):
             raise BadInput(
                 f"--visible {self.visible:g}: give a share of the views, more than 0 and at most 1, or a number of them"
@@ -152,7 +152,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ComparisonResult:
     """All that was measured.
 
     Attributes:
@@ -168,24 +168,24 @@ class Outcome:
         outside: Shares of the reconstruction above, below and beside the volume; None without one.
     """
 
-    draws: tuple[Draw, ...]
-    others: dict[str, Draw | None]
+    draws: tuple[RepetitionResult, ...]
+    others: dict[str, RepetitionResult | None]
     tau: float
     matrix: np.ndarray
     crop: Crop | None
     seen: int | None
     voxel: float | None
-    sides: tuple[Side, Side]
+    sides: tuple[ComparedSurface, ComparedSurface]
     outside: dict[str, float] | None = None
 
 
 def compare(
-    reconstruction: Surface,
-    truth: Surface,
+    reconstruction: SurfaceFile,
+    truth: SurfaceFile,
     settings: Comparison,
     views: Sequence[View] = (),
     frame: Frame | None = None,
-) -> Outcome:
+) -> ComparisonResult:
     """Measure a reconstruction.
 
     Args:
@@ -214,16 +214,16 @@ def compare(
         theirs = make_side(truth, None, settings.samples, tau, box)
     warn_if_sparse(ours, own_tau)
     warn_if_sparse(theirs, tau)
-    draws: list[Draw] = []
-    others: dict[str, Draw | None] = {}
-    done, total = 0, len(WAYS) + settings.draws - 1
+    draws: list[RepetitionResult] = []
+    others: dict[str, RepetitionResult | None] = {}
+    done, total = 0, len(ALIGNMENTS) + settings.draws - 1
     emit(Progress("measuring", done, total))
     for number in range(settings.draws):
         measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
         if number == 0:
             measure.refuse_other_frame(matrix)
         found = {}
-        for way in (settings.align,) if number else WAYS:
+        for way in (settings.align,) if number else ALIGNMENTS:
             found[way] = measure.draw(matrix, way)
             done += 1
             emit(Progress("measuring", done, total))
@@ -233,10 +233,10 @@ def compare(
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
     outside = crop and outside_shares(reconstruction, draws[0].alignment.matrix, crop)
-    return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside)
+    return ComparisonResult(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside)
 
 
-def refuse_sizes(settings: Comparison, truth: Surface) -> None:
+def refuse_sizes(settings: Comparison, truth: SurfaceFile) -> None:
     """BadInput for lengths that have nothing to do with the size of the truth."""
     ends = [(block.min(0), block.max(0)) for block in truth.blocks() if len(block)]
     if not ends:
@@ -245,14 +245,15 @@ def refuse_sizes(settings: Comparison, truth: Surface) -> None:
     span = float(np.linalg.norm(high - low))
     for name in ("tau", "voxel", "radius", "far"):
         value = getattr(settings, name)
-        if value is not None and not SHORTEST * span <= value <= FURTHEST * span and span > 0:
+        if value is not None and not MIN_LENGTH_SHARE * span <= value <= MAX_LENGTH_SHARE * span and span > 0:
             raise BadInput(
-                f"--{name} {value:g}: {truth.path} spans {span:.3g}, so it must lie between {SHORTEST * span:.3g} and "
-                f"{FURTHEST * span:.3g}"
+                f"--{name} {value:g}: {truth.path} spans {span:.3g}, so it must lie between "
+                f"{MIN_LENGTH_SHARE * span:.3g} and "
+                f"{MAX_LENGTH_SHARE * span:.3g}"
             )
 
 
-def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
+def truth_side(truth: SurfaceFile, settings: Comparison) -> tuple[ComparedSurface, float]:
     """What the truth is drawn from, and tau."""
     if truth.faces is not None:
         if settings.tau is None:
@@ -272,7 +273,9 @@ def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
     return found, tau
 
 
-def make_side(surface: Surface, voxel: float | None, samples: int | None, tau: float, box: Box | None = None) -> Side:
+def make_side(
+    surface: SurfaceFile, voxel: float | None, samples: int | None, tau: float, box: Box | None = None
+) -> ComparedSurface:
     """What points are drawn from, whichever the file holds; see `mesh_side`."""
     return cloud_side(surface, voxel) if surface.faces is None else mesh_side(surface, samples, tau, box)
 
@@ -283,7 +286,7 @@ def around(crop: Crop, tau: float) -> Box:
     low, high = np.empty(3), np.empty(3)
     low[plane], high[plane] = crop.polygon.min(0), crop.polygon.max(0)
     low[along], high[along] = crop.low, crop.high
-    room = ROUNDS[0][1] * tau
+    room = ICP_ROUNDS[0][1] * tau
     return low - room, high + room
 
 
@@ -321,14 +324,15 @@ def volume(
 
 def usual_visible(views: int) -> float:
     """Which views must see a point, as `CropSettings` has it, where nothing is said."""
-    return SHARE if SHARE * views <= ENOUGH else ENOUGH
+    return MIN_VIEW_SHARE if MIN_VIEW_SHARE * views <= SUFFICIENT_VIEWS else SUFFICIENT_VIEWS
 
 
-def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
+def usable(draw: RepetitionResult | None, tau: float, quiet: bool) -> RepetitionResult:
     """The repetition, or BadInput if alignment left too little, or the two nowhere near each other."""
     if draw is None:
         raise BadInput(
-            f"after alignment fewer than {LEAST} points are left in the crop volume, thinned to half of tau "
+            f"after alignment fewer than {MIN_COMPARED_POINTS} points are left in the crop volume, thinned to half "
+            f"of tau "
             f"({tau:.3g}): if frames or units differ, give --transform, else lower --tau or widen --crop"
         )
     apart = min(float(np.median(draw.distances.to_truth)), float(np.median(draw.distances.to_reconstruction)))
@@ -339,19 +343,19 @@ def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
         f"{left}, and {draw.alignment.matched:.0%} of the points have a partner; the reconstruction spans "
         f"{extent_text(draw.reconstruction)} then, and the truth {extent_text(draw.truth)}"
     )
-    if apart > FAR_OFF * tau:
+    if apart > CERTAIN_MISS_TAUS * tau:
         raise BadInput(f"the truth is in another frame or unit: {text}; give --transform, or a larger --tau")
-    if apart > OFF * tau and not quiet:
+    if apart > SUSPECT_MISS_TAUS * tau and not quiet:
         emit(Warned(f"the reconstruction is rough, or the truth is in another frame or unit (--transform): {text}"))
     return draw
 
 
-def warn_of_loss(draw: Draw, unaligned: Draw | None, way: str, tau: float) -> None:
+def warn_of_loss(draw: RepetitionResult, unaligned: RepetitionResult | None, way: str, tau: float) -> None:
     """Warn if the two fit less well after alignment than before."""
     if unaligned is None:
         return
     before, after = (shares(each.distances, tau)[2] for each in (unaligned, draw))
-    if after < before - LOSS:
+    if after < before - MAX_F1_LOSS:
         emit(
             Warned(
                 f"--align {way} lowers F1 from {before:.3f} to {after:.3f}: if both are in one frame, take --align none"
@@ -361,7 +365,7 @@ def warn_of_loss(draw: Draw, unaligned: Draw | None, way: str, tau: float) -> No
 
 def warn_of_size(change: float) -> None:
     """Warn if alignment had to change the scale much."""
-    if abs(change - 1) > RESIZED:
+    if abs(change - 1) > MAX_SCALE_CHANGE:
         emit(
             Warned(
                 f"ICP changed the size of the reconstruction by {change - 1:+.1%}: check the unit of the truth, and "

@@ -13,22 +13,22 @@ from surfkit.io.splats.ply import write_points
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import PLANES, Axis, Crop
 
-STOPS = np.array([0.0, 1.0, 1.0001, 2.5, 5.0])
+RAMP_STOPS = np.array([0.0, 1.0, 1.0001, 2.5, 5.0])
 """Distances, multiples of tau, at which the colours stand."""
-COLORS = np.array([[205, 222, 236], [52, 108, 186], [250, 190, 80], [214, 70, 40], [92, 6, 32]], float)
+ERROR_RAMP = np.array([[205, 222, 236], [52, 108, 186], [250, 190, 80], [214, 70, 40], [92, 6, 32]], float)
 """Pale to blue is right, orange to dark red is wrong: told apart by people who do not tell red from green, too."""
-LONGEST_PX = 720
+PICTURE_LONGEST_PX = 720
 """Of each part of a picture."""
-PAPER, INK = (255, 255, 255), (40, 40, 40)
+PAPER_COLOR, INK_COLOR = (255, 255, 255), (40, 40, 40)
 CAPTION_PX = 24
-SHADE, MOST_BEHIND = 0.04, 3.0
+SHADE_PER_UNIT, MAX_SHADED_UNITS = 0.04, 3.0
 """How dark a neighbour that lies one unit nearer makes a pixel, and the most units that count."""
 
 
 def error_colors(distances: np.ndarray, tau: float) -> np.ndarray:
     """(n, 3) uint8 of (n,) distances."""
-    share = (distances / tau).clip(max=STOPS[-1])
-    return np.stack([np.interp(share, STOPS, COLORS[:, i]) for i in range(3)], axis=1).round().astype(np.uint8)
+    share = (distances / tau).clip(max=RAMP_STOPS[-1])
+    return np.stack([np.interp(share, RAMP_STOPS, ERROR_RAMP[:, i]) for i in range(3)], axis=1).round().astype(np.uint8)
 
 
 def write_cloud(path: Path, points: np.ndarray, distances: np.ndarray, tau: float) -> None:
@@ -51,7 +51,7 @@ def draw_from_view(
     at, x, y, z = project(points, camera, pose)
     focal = max(camera.fx, camera.fy)
     depth, rows = nearest_rows(x, y, z, sides(spacing * focal / z), (camera.height, camera.width))
-    return shaded(np.concatenate([colors[at], [PAPER]])[rows], depth, np.maximum(depth / focal, spacing))
+    return shaded(np.concatenate([colors[at], [PAPER_COLOR]])[rows], depth, np.maximum(depth / focal, spacing))
 
 
 def from_above(
@@ -67,14 +67,14 @@ def from_above(
         spacing: Between neighbouring points.
     """
     low, high = box
-    pixel = float((high - low).max()) / LONGEST_PX
-    width, height = (np.ceil((high - low) / pixel).astype(int) + 1).clip(max=LONGEST_PX + 1)
+    pixel = float((high - low).max()) / PICTURE_LONGEST_PX
+    width, height = (np.ceil((high - low) / pixel).astype(int) + 1).clip(max=PICTURE_LONGEST_PX + 1)
     spots = (points[:, list(PLANES[up])] - low) / pixel
     inside = ((spots >= 0) & (spots < (width, height))).all(1)
     x, y = spots[inside].astype(np.int64).T
     side = sides(np.full(len(x), spacing / pixel))
     depth, rows = nearest_rows(x, y, -points[inside, "xyz".index(up)], side, (int(height), int(width)))
-    picture = np.concatenate([colors[inside], [PAPER]])[rows]
+    picture = np.concatenate([colors[inside], [PAPER_COLOR]])[rows]
     return shaded(picture, depth, np.full(depth.shape, max(pixel, spacing)))[::-1]
 
 
@@ -93,8 +93,8 @@ def shaded(picture: np.ndarray, depth: np.ndarray, unit: np.ndarray) -> np.ndarr
             beside = np.roll(depth, shift, axis)
             known = there & np.isfinite(beside)
             step = np.where(known, depth, 0) - np.where(known, beside, 0)
-            behind += np.where(known, step / np.where(there, unit, 1), 0).clip(0, MOST_BEHIND)
-    return np.where(there[..., None], picture * np.exp(-SHADE * behind)[..., None], picture).astype(np.uint8)
+            behind += np.where(known, step / np.where(there, unit, 1), 0).clip(0, MAX_SHADED_UNITS)
+    return np.where(there[..., None], picture * np.exp(-SHADE_PER_UNIT * behind)[..., None], picture).astype(np.uint8)
 
 
 def write_plan(
@@ -119,9 +119,9 @@ def write_plan(
     for _, points, colors in parts:
         image = Image.fromarray(from_above(points, colors, (low, high), up, spacing))
         if crop is not None and crop.axis == up:
-            pixel = float((high - low).max()) / LONGEST_PX
+            pixel = float((high - low).max()) / PICTURE_LONGEST_PX
             ring = [(x, image.height - 1 - y) for x, y in ((crop.polygon - low) / pixel).tolist()]
-            ImageDraw.Draw(image).line([*ring, ring[0]], fill=INK, width=2)
+            ImageDraw.Draw(image).line([*ring, ring[0]], fill=INK_COLOR, width=2)
         images.append(np.asarray(image))
     write_row(path, [caption for caption, _, _ in parts], images)
 
@@ -130,10 +130,10 @@ def write_row(path: Path, captions: list[str], images: list[np.ndarray]) -> None
     """Save (H, W, 3) uint8 images side by side as PNG, each under its caption."""
     height = max(image.shape[0] for image in images)
     width = sum(image.shape[1] for image in images) + CAPTION_PX // 2 * (len(images) - 1)
-    sheet = Image.new("RGB", (width, height + CAPTION_PX), PAPER)
+    sheet = Image.new("RGB", (width, height + CAPTION_PX), PAPER_COLOR)
     pen, left = ImageDraw.Draw(sheet), 0
     for caption, image in zip(captions, images, strict=True):
-        pen.text((left + 4, 4), caption, INK, ImageFont.load_default(14))
+        pen.text((left + 4, 4), caption, INK_COLOR, ImageFont.load_default(14))
         sheet.paste(Image.fromarray(image), (left, CAPTION_PX))
         left += image.shape[1] + CAPTION_PX // 2
     with replacing(path) as file:

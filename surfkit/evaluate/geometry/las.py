@@ -16,11 +16,11 @@ CLOUDS = (".las", ".laz")
 SCANS = (*CLOUDS, ".e57")
 MAX_POINTS = 40_000_000
 """Points that are kept of a larger file: a gigabyte of positions."""
-AT_ONCE = 1_000_000
+CHUNK_POINTS = 1_000_000
 """Points in memory besides."""
 RECORDS = {"WktCoordinateSystemVlr", "GeoKeyDirectoryVlr"}
 """Of laspy, what a reference system is in."""
-COLORS = ("red", "green", "blue")
+COLOR_FIELDS = ("red", "green", "blue")
 
 
 def read_e57(path: Path) -> np.ndarray:
@@ -94,13 +94,13 @@ def _tell_fewer(path: Path, used: int, count: int) -> None:
 def _points(file: Any, most: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions, and colours if there are some."""
     every, before, places, colors = max(1, -(-file.header.point_count // most)), 0, [], []
-    colored = set(COLORS) <= set(file.header.point_format.dimension_names)
-    for chunk in file.chunk_iterator(AT_ONCE):
+    colored = set(COLOR_FIELDS) <= set(file.header.point_format.dimension_names)
+    for chunk in file.chunk_iterator(CHUNK_POINTS):
         rows = slice(-before % every, None, every)
         before += len(chunk)
         places.append(np.stack([np.asarray(chunk[axis])[rows] for axis in "xyz"], axis=1))
         if colored:
-            colors.append(np.stack([np.asarray(chunk[name])[rows] for name in COLORS], axis=1))
+            colors.append(np.stack([np.asarray(chunk[name])[rows] for name in COLOR_FIELDS], axis=1))
     xyz = np.concatenate(places) if places else np.zeros((0, 3))
     rgb = np.concatenate(colors) if colors else np.zeros((0, 3), np.uint16)
     if not rgb.any():

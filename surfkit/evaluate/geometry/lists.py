@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.ply import TYPES, element_layout, open_header
+from surfkit.io.splats.ply import PLY_TYPES, element_layout, open_header
 
-LIST = "property list "
+LIST_PREFIX = "property list "
 
 
 def has_lists(lines: Sequence[str]) -> bool:
     """Whether a PLY header begins with points that have lists."""
-    return any(line.startswith(LIST) for line in _of_points(lines))
+    return any(line.startswith(LIST_PREFIX) for line in _of_points(lines))
 
 
 def points_beside_lists(path: Path, lines: Sequence[str]) -> np.ndarray:
@@ -33,7 +33,7 @@ def points_beside_lists(path: Path, lines: Sequence[str]) -> np.ndarray:
         BadInput: Damaged, or the coordinates do not come first.
     """
     head, *own = _of_points(lines)
-    first = next(i for i, line in enumerate(own) if line.startswith(LIST))
+    first = next(i for i, line in enumerate(own) if line.startswith(LIST_PREFIX))
     if not {"x", "y", "z"} <= {line.split()[-1] for line in own[:first]}:
         raise BadInput(f"{path}: x, y and z of its points do not come before {own[first]!r}; leave that list out")
     _, count, dtype = element_layout(path, [head, *own[:first]])
@@ -99,9 +99,9 @@ def _steps(path: Path, properties: Sequence[str]) -> list[Callable[[mmap.mmap, i
     steps: list[Callable[[mmap.mmap, int], int]] = []
     for word in (line.split() for line in properties):
         is_list = word[1] == "list"
-        if len(word) != (5 if is_list else 3) or not {*word[1 + is_list : -1]} <= TYPES.keys():
-            raise BadInput(f"{path}: cannot read {' '.join(word)!r} of a vertex; types: {', '.join(TYPES)}")
-        sizes = [np.dtype(TYPES[name]) for name in word[1 + is_list : -1]]
+        if len(word) != (5 if is_list else 3) or not {*word[1 + is_list : -1]} <= PLY_TYPES.keys():
+            raise BadInput(f"{path}: cannot read {' '.join(word)!r} of a vertex; types: {', '.join(PLY_TYPES)}")
+        sizes = [np.dtype(PLY_TYPES[name]) for name in word[1 + is_list : -1]]
         if is_list and sizes[0].kind == "f":
             raise BadInput(f"{path}: {' '.join(word)!r} counts its numbers with {word[2]}; write the file again")
         steps.append(_list_step(*sizes) if is_list else _step(sizes[0].itemsize))

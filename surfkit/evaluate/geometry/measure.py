@@ -13,9 +13,9 @@ from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.evaluate.geometry.chart import write_chart
 from surfkit.evaluate.geometry.class_pictures import write_classes
 from surfkit.evaluate.geometry.classes import class_figures, classify
-from surfkit.evaluate.geometry.comparison import Comparison, Outcome, compare
+from surfkit.evaluate.geometry.comparison import Comparison, ComparisonResult, compare
 from surfkit.evaluate.geometry.errors import (
-    LONGEST_PX,
+    PICTURE_LONGEST_PX,
     draw_from_view,
     error_colors,
     write_cloud,
@@ -24,7 +24,7 @@ from surfkit.evaluate.geometry.errors import (
 )
 from surfkit.evaluate.geometry.faithful import normal_angles, roughness_on_truth
 from surfkit.evaluate.geometry.place import same_plan
-from surfkit.evaluate.geometry.repetition import Draw
+from surfkit.evaluate.geometry.repetition import RepetitionResult
 from surfkit.evaluate.geometry.scores import chamfer, curve, shares
 from surfkit.evaluate.geometry.surface import read_surface, system_of
 from surfkit.evaluate.geometry.transform import apply, scale_of, write_transform
@@ -33,13 +33,13 @@ from surfkit.evaluate.mesh.measure import measure_mesh
 from surfkit.scene.crop import write_crop
 from surfkit.scene.scene import Frame, View
 
-REACH = 5
+CURVE_TAUS = 5
 """Multiples of tau that the curve covers."""
-FAR = 20.0
+CHAMFER_CUTOFF_TAUS = 20.0
 """Multiples of tau above which distances do not count in the chamfer distance of DTU, by default."""
-PICTURES = 3
+DRAWN_VIEWS = 3
 """Views that are drawn."""
-NAMES = ("precision", "recall", "f1")
+SCORE_NAMES = ("precision", "recall", "f1")
 
 
 def measure_geometry(
@@ -94,14 +94,14 @@ def warn_of_other_system(truth: Path, frame: Frame) -> None:
         emit(Warned(f"{truth}: its coordinates are in {theirs}, and those of the photographs in {frame.crs}"))
 
 
-def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
+def figures(outcome: ComparisonResult, settings: Comparison) -> dict[str, Any]:
     """Plain data: precision, recall and F1 with standard deviations, chamfer distances, alignments."""
     tau = outcome.tau
-    each = [dict(zip(NAMES, shares(draw.distances, tau), strict=True)) for draw in outcome.draws]
-    means = {name: statistics.fmean(draw[name] for draw in each) for name in NAMES}
-    spread = {f"{name}_std": statistics.stdev(d[name] for d in each) if len(each) > 1 else None for name in NAMES}
-    first, far = outcome.draws[0], settings.far or FAR * tau
-    taus = np.linspace(0, REACH * tau, 4 * REACH + 1)
+    each = [dict(zip(SCORE_NAMES, shares(draw.distances, tau), strict=True)) for draw in outcome.draws]
+    means = {name: statistics.fmean(draw[name] for draw in each) for name in SCORE_NAMES}
+    spread = {f"{name}_std": statistics.stdev(d[name] for d in each) if len(each) > 1 else None for name in SCORE_NAMES}
+    first, far = outcome.draws[0], settings.far or CHAMFER_CUTOFF_TAUS * tau
+    taus = np.linspace(0, CURVE_TAUS * tau, 4 * CURVE_TAUS + 1)
     precision, recall = curve(first.distances, taus).T.tolist()
     crop = outcome.crop
     return {
@@ -124,7 +124,7 @@ def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
     }
 
 
-def _alignment(draw: Draw, outcome: Outcome) -> dict[str, Any]:
+def _alignment(draw: RepetitionResult, outcome: ComparisonResult) -> dict[str, Any]:
     """One way of aligning: what it changed, how well it fits, and what it gives."""
     found = draw.alignment
     change = found.matrix @ np.linalg.inv(outcome.matrix)
@@ -136,12 +136,12 @@ def _alignment(draw: Draw, outcome: Outcome) -> dict[str, Any]:
         "turned_degrees": float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))),
         "residual": found.residual,
         "matched": found.matched,
-        **dict(zip(NAMES, shares(draw.distances, outcome.tau), strict=True)),
+        **dict(zip(SCORE_NAMES, shares(draw.distances, outcome.tau), strict=True)),
         "matrix": found.matrix.tolist(),
     }
 
 
-def write_files(out: Path, outcome: Outcome, settings: Comparison) -> None:
+def write_files(out: Path, outcome: ComparisonResult, settings: Comparison) -> None:
     """Write the crop volume, the transform, both clouds coloured by error, the curve and the plan."""
     draw, tau = outcome.draws[0], outcome.tau
     if outcome.crop is not None:
@@ -149,7 +149,7 @@ def write_files(out: Path, outcome: Outcome, settings: Comparison) -> None:
     write_transform(out / "transform.txt", draw.alignment.matrix)
     write_cloud(out / "precision.ply", draw.reconstruction, draw.distances.to_truth, tau)
     write_cloud(out / "recall.ply", draw.truth, draw.distances.to_reconstruction, tau)
-    taus = np.linspace(0, REACH * tau, 201)
+    taus = np.linspace(0, CURVE_TAUS * tau, 201)
     precision, recall, f1 = shares(draw.distances, tau)
     title = f"precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f} at tau = {tau:.3g}"
     write_chart(out / "curve.png", taus, curve(draw.distances, taus), tau, title)
@@ -158,7 +158,7 @@ def write_files(out: Path, outcome: Outcome, settings: Comparison) -> None:
         emit(FileWritten(out / name, "geometry"))
 
 
-def _parts(draw: Draw, tau: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
+def _parts(draw: RepetitionResult, tau: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Both clouds with captions and colours."""
     captions = (
         f"reconstruction: blue within {tau:.3g} of the truth, orange to red wrong",
@@ -169,13 +169,13 @@ def _parts(draw: Draw, tau: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
     return [(c, p, error_colors(d, tau)) for c, p, d in zip(captions, clouds, distances, strict=True)]
 
 
-def write_views(out: Path, outcome: Outcome, views: Sequence[View], frame: Frame) -> None:
+def write_views(out: Path, outcome: ComparisonResult, views: Sequence[View], frame: Frame) -> None:
     """Draw both clouds, coloured by error, as a few of the training views see them."""
     draw, tau = outcome.draws[0], outcome.tau
     back = np.linalg.inv(draw.alignment.matrix)
-    for i in range(min(PICTURES, len(views))):
-        view = views[(2 * i + 1) * len(views) // (2 * min(PICTURES, len(views)))]
-        camera = view.camera.sized(LONGEST_PX)
+    for i in range(min(DRAWN_VIEWS, len(views))):
+        view = views[(2 * i + 1) * len(views) // (2 * min(DRAWN_VIEWS, len(views)))]
+        camera = view.camera.sized(PICTURE_LONGEST_PX)
         pose = frame.input_pose(camera.world_to_camera)
         gap = tau / scale_of(draw.alignment.matrix)
         parts = _parts(draw, tau)

@@ -7,10 +7,10 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.scene.sets import is_among
 
-CELLS = 8
+RADIUS_CELLS = 8
 """Points closer than a radius over this, or than the extent over the next, are one: the triangulation stays small."""
-FINEST = 400
-STRAY = 0.01
+EXTENT_CELLS = 400
+MIN_PIECE_SHARE = 0.01
 """Pieces of less than this share of the area do not count."""
 
 
@@ -26,7 +26,7 @@ def outline(points: np.ndarray, radius: float) -> np.ndarray:
     from scipy.spatial import Delaunay, QhullError
 
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    points = _spread(points, min(radius / CELLS, extent / FINEST)) if extent > 0 else points[:1]
+    points = _spread(points, min(radius / RADIUS_CELLS, extent / EXTENT_CELLS)) if extent > 0 else points[:1]
     centre = points.mean(0) if len(points) else 0.0
     try:
         triangles = Delaunay(points - centre).simplices if len(points) > 2 else None
@@ -74,7 +74,7 @@ def _one_piece(triangles: np.ndarray, areas: np.ndarray) -> np.ndarray | None:
     pairs = (np.ones(len(shared)), (owner[shared], owner[shared + 1]))
     count, piece = connected_components(csr_matrix(pairs, shape=(len(triangles),) * 2), directed=False)
     share = np.bincount(piece, areas, minlength=count) / areas.sum()
-    large = np.flatnonzero(share >= STRAY)
+    large = np.flatnonzero(share >= MIN_PIECE_SHARE)
     return triangles[piece == large[0]] if len(large) == 1 else None
 
 

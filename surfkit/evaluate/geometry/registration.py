@@ -14,21 +14,21 @@ import numpy as np
 from surfkit.evaluate.geometry.scores import WORKERS, tree
 from surfkit.evaluate.geometry.transform import apply, fitted, scale_of
 
-ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
+ICP_ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
 """Voxel and reach of each round, multiples of tau (the Tanks and Temples toolbox, whose last round thins by count)."""
 ITERATIONS = 20
-RESIZED = 2.0
+MAX_SCALE_FACTOR = 2.0
 """Factor of size at which a round gives up."""
-CHANGE = 1e-6
+MIN_CHANGE = 1e-6
 """Of the matched share and of the residual, as a share of it, at which a round is over."""
-MUTUAL = 2.0
+MUTUAL_VOXELS = 2.0
 """Voxels between a point and the one that its partner finds, up to which the two are a mutual match."""
-MOST = 100_000
+MAX_MATCHED_POINTS = 100_000
 """Points of the reconstruction that are matched: many more than seven numbers need."""
 
 
 @dataclass(frozen=True)
-class Alignment:
+class IcpResult:
     """What ICP found.
 
     Attributes:
@@ -52,7 +52,7 @@ Clouds = Callable[[float, np.ndarray], tuple[np.ndarray, object, np.ndarray]]
 tree and as the (m, 3) points of it, each thinned and inside the crop volume."""
 
 
-def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool, mutual: bool = False) -> Alignment:
+def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool, mutual: bool = False) -> IcpResult:
     """The reconstruction brought to the truth, from a start that is not far off.
 
     Args:
@@ -62,12 +62,12 @@ def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool, mutua
         with_scale: Whether the size may change.
         mutual: Whether only mutual matches count.
     """
-    found = Alignment(start, 0.0, None)
-    for voxel, reach in ROUNDS:
+    found = IcpResult(start, 0.0, None)
+    for voxel, reach in ICP_ROUNDS:
         source, there, target = clouds(voxel * tau, found.matrix)
-        if len(source) > MOST:
-            source = source[np.linspace(0, len(source) - 1, MOST).astype(np.int64)]
-        begin, slack = Alignment(found.matrix, 0.0, None), MUTUAL * voxel * tau if mutual else None
+        if len(source) > MAX_MATCHED_POINTS:
+            source = source[np.linspace(0, len(source) - 1, MAX_MATCHED_POINTS).astype(np.int64)]
+        begin, slack = IcpResult(found.matrix, 0.0, None), MUTUAL_VOXELS * voxel * tau if mutual else None
         found = icp(source, there, target, begin, reach * tau, with_scale, slack)
     return found
 
@@ -76,11 +76,11 @@ def icp(
     source: np.ndarray,
     there: object,
     target: np.ndarray,
-    start: Alignment,
+    start: IcpResult,
     reach: float,
     with_scale: bool,
     slack: float | None = None,
-) -> Alignment:
+) -> IcpResult:
     """One round: match each point with the nearest within reach, fit, and again, until nothing changes.
 
     Args:
@@ -100,20 +100,20 @@ def icp(
         if here is not None and slack is not None:
             near[near] = _answered(source[near], here, source, target[partner[near]], found.matrix, slack)
         residual = float(np.sqrt((away[near] ** 2).mean())) if near.any() else None
-        now = Alignment(found.matrix, float(near.mean()), residual)
+        now = IcpResult(found.matrix, float(near.mean()), residual)
         settled = found.residual is not None and residual is not None
-        settled = settled and abs(now.matched - found.matched) < CHANGE
-        if settled and abs(residual - found.residual) < CHANGE * max(residual, found.residual):
+        settled = settled and abs(now.matched - found.matched) < MIN_CHANGE
+        if settled and abs(residual - found.residual) < MIN_CHANGE * max(residual, found.residual):
             return now
         if near.sum() < 3 or residual == 0:
             return now
         matrix = fitted(source[near], target[partner[near]], with_scale)
-        if not 1 / RESIZED < np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) / start.scale < RESIZED:
+        if not 1 / MAX_SCALE_FACTOR < np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) / start.scale < MAX_SCALE_FACTOR:
             return now  # the two do not fit, and a smaller one is always nearer
-        found = Alignment(matrix, now.matched, now.residual)
+        found = IcpResult(matrix, now.matched, now.residual)
     away, _ = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
     near = np.isfinite(away)
-    return Alignment(found.matrix, float(near.mean()), float(np.sqrt((away[near] ** 2).mean())) if near.any() else None)
+    return IcpResult(found.matrix, float(near.mean()), float(np.sqrt((away[near] ** 2).mean())) if near.any() else None)
 
 
 def _answered(

@@ -11,38 +11,38 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.memory import size
-from surfkit.evaluate.geometry.registration import Alignment, align
+from surfkit.evaluate.geometry.registration import IcpResult, align
 from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
 from surfkit.evaluate.geometry.scores import WORKERS, Distances, nearest, tree
-from surfkit.evaluate.geometry.surface import Surface, part_within
+from surfkit.evaluate.geometry.surface import SurfaceFile, part_within
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
 from surfkit.scene.crop import Crop
 from surfkit.scene.memory import free_bytes
 
-MOST = 4_000_000
+MAX_COMPARED_POINTS = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
-FOR_ICP = 400_000
+MAX_ICP_POINTS = 400_000
 """Points of the reconstruction that ICP thins and looks at: many more than seven numbers need."""
-FOR_MISSED = 100_000
+MAX_MISSED_POINTS = 100_000
 """Points of the truth by which alignments are compared."""
-GAIN = 0.02
+MIN_ALIGNMENT_GAIN = 0.02
 """Share by which another alignment must leave less of the truth uncovered than the usual one, to take its place."""
 UNTOLD_SIZE = 1e-3
 """Change of size by ICP that is taken as it is; a larger one must gain."""
-LEAST = 10
+MIN_COMPARED_POINTS = 10
 """Points on either side without which shares mean nothing."""
 SAMPLE_BYTES = 200
 """Memory for a point that is drawn from a mesh; as much again for one of the other side."""
 Box = tuple[np.ndarray, np.ndarray]
 """(3,) least and (3,) greatest coordinates."""
-SMALL = 0.1
+MIN_EXTENT_RATIO = 0.1
 """Of the truth's extent: a reconstruction smaller than this has another unit."""
 
 
 @dataclass(frozen=True)
-class Side:
+class ComparedSurface:
     """The reconstruction or the truth, from which points can be drawn.
 
     Attributes:
@@ -53,7 +53,7 @@ class Side:
         sparse: Samples of a mesh that would be needed, where it gets fewer.
     """
 
-    surface: Surface
+    surface: SurfaceFile
     cloud: np.ndarray | None
     count: int
     voxel: float | None = None
@@ -65,7 +65,7 @@ class Side:
 
 
 @dataclass(frozen=True)
-class Draw:
+class RepetitionResult:
     """One repetition of the measurement.
 
     Attributes:
@@ -78,21 +78,21 @@ class Draw:
     reconstruction: np.ndarray
     truth: np.ndarray
     distances: Distances
-    alignment: Alignment
+    alignment: IcpResult
 
 
-def cloud_side(surface: Surface, voxel: float | None) -> Side:
-    """A cloud that is read, and thinned, now; larger ones than `MOST` also if no voxel is given."""
-    if voxel is None and len(surface) <= MOST:
-        return Side(surface, np.concatenate(list(surface.blocks())), len(surface))
+def cloud_side(surface: SurfaceFile, voxel: float | None) -> ComparedSurface:
+    """A cloud that is read, and thinned, now; larger ones than `MAX_COMPARED_POINTS` also if no voxel is given."""
+    if voxel is None and len(surface) <= MAX_COMPARED_POINTS:
+        return ComparedSurface(surface, np.concatenate(list(surface.blocks())), len(surface))
     if voxel is None:
-        voxel = voxel_for(surface.blocks, MOST)
+        voxel = voxel_for(surface.blocks, MAX_COMPARED_POINTS)
         emit(Warned(f"{surface.path}: {len(surface)} points, thinned to one in each voxel of {voxel:.3g}"))
     cloud = thin(surface.blocks(), voxel, next(block[0] for block in surface.blocks() if len(block)))
-    return Side(surface, cloud, len(cloud), voxel)
+    return ComparedSurface(surface, cloud, len(cloud), voxel)
 
 
-def mesh_side(surface: Surface, count: int | None, tau: float, box: Box | None = None) -> Side:
+def mesh_side(surface: SurfaceFile, count: int | None, tau: float, box: Box | None = None) -> ComparedSurface:
     """A mesh, of which as many points are drawn as it has vertices and faces, as the paper does.
 
     A coarse mesh gets more, so that they lie no further apart than 0.7 tau: right surfaces would count as missing.
@@ -109,18 +109,22 @@ def mesh_side(surface: Surface, count: int | None, tau: float, box: Box | None =
     if count is None:
         area, least = float(face_areas(surface).sum()), len(surface) + len(surface.faces)
         needed = _needed(area, tau)
-        if needed > max(least, MOST) and box is not None and len((part := part_within(surface, *box)).faces):
+        if (
+            needed > max(least, MAX_COMPARED_POINTS)
+            and box is not None
+            and len((part := part_within(surface, *box)).faces)
+        ):
             inner = float(face_areas(part).sum())
-            surface, needed, least = part, _needed(inner, tau), max(LEAST, int(least * inner / area))
-        count = max(least, min(needed, MOST))
+            surface, needed, least = part, _needed(inner, tau), max(MIN_COMPARED_POINTS, int(least * inner / area))
+        count = max(least, min(needed, MAX_COMPARED_POINTS))
         sparse = needed if count < needed else None
     free = free_bytes()
     if count * SAMPLE_BYTES > free:
         raise BadInput(
             f"{surface.path}: {count:,} samples take {size(count * SAMPLE_BYTES)}, and {size(free)} are free; give "
-            f"--samples {max(LEAST, free // SAMPLE_BYTES // 2)} or less"
+            f"--samples {max(MIN_COMPARED_POINTS, free // SAMPLE_BYTES // 2)} or less"
         )
-    return Side(surface, None, count, sparse=sparse)
+    return ComparedSurface(surface, None, count, sparse=sparse)
 
 
 def _needed(area: float, tau: float) -> int:
@@ -128,7 +132,7 @@ def _needed(area: float, tau: float) -> int:
     return int(2 * area / tau**2) + 1
 
 
-def warn_if_sparse(side: Side, tau: float) -> None:
+def warn_if_sparse(side: ComparedSurface, tau: float) -> None:
     """Warn of samples of a mesh that lie too far apart."""
     if side.sparse is not None:
         emit(
@@ -150,14 +154,16 @@ class Measurement:
         draw: Of the points and of where the lattice of voxels begins.
     """
 
-    def __init__(self, ours: Side, theirs: Side, crop: Crop | None, tau: float, draw: np.random.Generator) -> None:
+    def __init__(
+        self, ours: ComparedSurface, theirs: ComparedSurface, crop: Crop | None, tau: float, draw: np.random.Generator
+    ) -> None:
         self.crop, self.tau, self.paths = crop, tau, (ours.surface.path, theirs.surface.path)
         target, self.offset = theirs.points(draw), draw.random(3)  # first: the same for every reconstruction
         self.source = ours.points(draw)
         self.target = self.cropped(target)
         self.spans = extent_text(self.source), extent_text(target)
         self.targets = cache(self._target)
-        self.found: dict[tuple[bytes, bool], Alignment] = {}
+        self.found: dict[tuple[bytes, bool], IcpResult] = {}
 
     def cropped(self, points: np.ndarray) -> np.ndarray:
         """Those in the crop volume, of (n, 3) points in the frame of the truth."""
@@ -173,25 +179,25 @@ class Measurement:
 
     def clouds(self, voxel: float, matrix: np.ndarray) -> tuple[np.ndarray, object, np.ndarray]:
         """What a round of ICP compares (`registration.Clouds`)."""
-        few = self.source[:: max(1, len(self.source) // FOR_ICP)]
+        few = self.source[:: max(1, len(self.source) // MAX_ICP_POINTS)]
         moved = self.thinned(self.cropped(apply(matrix, few)), voxel)
         return apply(np.linalg.inv(matrix), moved), *self.targets(voxel)
 
-    def draw(self, start: np.ndarray, way: str) -> Draw | None:
+    def draw(self, start: np.ndarray, way: str) -> RepetitionResult | None:
         """Align in one way, and compare; None where that leaves too few points to compare."""
-        found = Alignment(start, 0.0, None) if way == "none" else self.aligned(start, way == "similarity")
+        found = IcpResult(start, 0.0, None) if way == "none" else self.aligned(start, way == "similarity")
         ours = self.thinned(self.cropped(apply(found.matrix, self.source)), self.tau / 2)
         there, theirs = self.targets(self.tau / 2)
-        if min(len(ours), len(theirs)) < LEAST:
+        if min(len(ours), len(theirs)) < MIN_COMPARED_POINTS:
             return None
         distances = Distances(nearest(there, ours), nearest(tree(ours), theirs))
         if way == "none":
             near = distances.to_truth[distances.to_truth < 2 * self.tau]
             residual = float(np.sqrt((near**2).mean())) if len(near) else None
-            found = Alignment(start, len(near) / len(ours), residual)
-        return Draw(ours, theirs, distances, found)
+            found = IcpResult(start, len(near) / len(ours), residual)
+        return RepetitionResult(ours, theirs, distances, found)
 
-    def aligned(self, start: np.ndarray, with_scale: bool) -> Alignment:
+    def aligned(self, start: np.ndarray, with_scale: bool) -> IcpResult:
         """The alignment that leaves least of the truth uncovered, of ICP by all matches, by mutual ones, and of none.
 
         All matches lead astray where the reconstruction reaches beyond the truth: a smaller, or a shifted one has more
@@ -200,20 +206,20 @@ class Measurement:
         """
         if (start.tobytes(), with_scale) not in self.found:
             first = align(self.clouds, start, self.tau, with_scale)
-            others = [align(self.clouds, start, self.tau, with_scale, mutual=True), Alignment(start, 0.0, None)]
+            others = [align(self.clouds, start, self.tau, with_scale, mutual=True), IcpResult(start, 0.0, None)]
             if with_scale and abs(first.scale / scale_of(start) - 1) > UNTOLD_SIZE:
                 others, first = [first, *others], self.aligned(start, with_scale=False)
             misses = {id(each): self.missed(each.matrix) for each in (first, *others)}
             best = min(others, key=lambda each: misses[id(each)])
-            better = misses[id(best)] < (1 - GAIN) * misses[id(first)]
+            better = misses[id(best)] < (1 - MIN_ALIGNMENT_GAIN) * misses[id(first)]
             self.found[start.tobytes(), with_scale] = best if better else first
         return self.found[start.tobytes(), with_scale]
 
     def missed(self, matrix: np.ndarray) -> float:
         """Mean distance, tau at most, of the truth in the crop volume to a reconstruction in that place."""
-        few = self.source[:: max(1, len(self.source) // FOR_ICP)]
+        few = self.source[:: max(1, len(self.source) // MAX_ICP_POINTS)]
         there, (_, target) = tree(apply(matrix, few)), self.targets(self.tau / 2)
-        target = target[:: max(1, len(target) // FOR_MISSED)]
+        target = target[:: max(1, len(target) // MAX_MISSED_POINTS)]
         away, _ = there.query(target, distance_upper_bound=self.tau, workers=WORKERS)
         return float(np.minimum(away, self.tau).mean())
 
@@ -223,11 +229,11 @@ class Measurement:
         places = f"the reconstruction spans {self.spans[0]}, the truth {self.spans[1]}"
         remedy = "if frames or units differ, give --transform; if the crop volume is wrong, --crop"
         for points, what, path in zip((moved, self.target), ("reconstruction", "truth"), self.paths, strict=True):
-            if len(points) < LEAST:
+            if len(points) < MIN_COMPARED_POINTS:
                 where = "in all" if self.crop is None else "inside the crop volume"
                 raise BadInput(f"{path}: {len(points)} points of the {what} {where}; {places}; {remedy}")
         sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (moved, self.target)]
-        if sizes[0] < SMALL * sizes[1]:
+        if sizes[0] < MIN_EXTENT_RATIO * sizes[1]:
             raise BadInput(
                 f"{self.paths[0]}: where they are compared, the reconstruction is {sizes[0]:.3g} across and the truth "
                 f"{sizes[1]:.3g}: another unit? {places}; {remedy}"
@@ -241,5 +247,5 @@ class Measurement:
 
 def refuse_few(points: np.ndarray, path: Path) -> None:
     """BadInput if shares of so few points would mean nothing."""
-    if len(points) < LEAST:
-        raise BadInput(f"{path}: {len(points)} points; {LEAST} or more are needed to compare with")
+    if len(points) < MIN_COMPARED_POINTS:
+        raise BadInput(f"{path}: {len(points)} points; {MIN_COMPARED_POINTS} or more are needed to compare with")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import BLOCK
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS
 
 WORKERS = 2
 """Threads that look for neighbours."""
@@ -34,13 +34,19 @@ def tree(points: np.ndarray) -> object:
 
 def nearest(there: object, points: np.ndarray) -> np.ndarray:
     """(n,) float64 distances of (n, 3) points to the nearest point of a tree."""
-    parts = [there.query(points[start : start + BLOCK], workers=WORKERS)[0] for start in range(0, len(points), BLOCK)]
+    parts = [
+        there.query(points[start : start + BLOCK_POINTS], workers=WORKERS)[0]
+        for start in range(0, len(points), BLOCK_POINTS)
+    ]
     return np.concatenate(parts) if parts else np.empty(0)
 
 
 def nearest_rows(there: object, points: np.ndarray) -> np.ndarray:
     """(n,) rows, in the tree, of the point nearest to each of (n, 3) points."""
-    parts = [there.query(points[start : start + BLOCK], workers=WORKERS)[1] for start in range(0, len(points), BLOCK)]
+    parts = [
+        there.query(points[start : start + BLOCK_POINTS], workers=WORKERS)[1]
+        for start in range(0, len(points), BLOCK_POINTS)
+    ]
     return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
 

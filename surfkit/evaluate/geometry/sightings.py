@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.visibility import COVER, LONGEST_PX, cloud_depth, not_hidden, project
+from surfkit.evaluate.geometry.visibility import DEPTH_LONGEST_PX, SQUARE_GAPS, cloud_depth, not_hidden, project
 from surfkit.scene.scene import Frame, View
 
-EDGE = 0.02
+MIN_EDGE_STEP = 0.02
 """Share of the depth by which neighbouring pixels must differ for an edge to lie between them."""
-WIDTHS = 4.0
+MIN_EDGE_WIDTHS = 4.0
 """Widths of a point's square by which they must differ as well: slanted surfaces differ by less."""
-EDGE_PX = 4
+EDGE_REACH_PX = 4
 """Pixels, of a picture 800 pixels long, within which a point is near an edge."""
 
 
@@ -45,7 +45,7 @@ def sightings(
     """
     found = tuple(Sightings(*(np.zeros(len(points), np.int32) for _ in range(2))) for points in clouds)
     for done, view in enumerate(views, 1):
-        camera = view.camera.sized(LONGEST_PX)
+        camera = view.camera.sized(DEPTH_LONGEST_PX)
         pose = frame.input_pose(camera.world_to_camera)
         depth, spots = cloud_depth(clouds[0], camera, pose, gap)
         near = near_edges(depth, gap)
@@ -70,8 +70,10 @@ def near_edges(depth: np.ndarray, gap: float) -> np.ndarray:
     for axis in (0, 1):
         here, there = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
         nearer = np.minimum(value[here], value[there])
-        step = np.abs(value[here] - value[there]) > np.maximum(EDGE * nearer, WIDTHS * COVER * gap)
+        step = np.abs(value[here] - value[there]) > np.maximum(
+            MIN_EDGE_STEP * nearer, MIN_EDGE_WIDTHS * SQUARE_GAPS * gap
+        )
         step &= known[here] & known[there]
         edge[here] |= step
         edge[there] |= step
-    return ndimage.maximum_filter(edge, size=2 * EDGE_PX + 1)
+    return ndimage.maximum_filter(edge, size=2 * EDGE_REACH_PX + 1)

@@ -16,13 +16,13 @@ from surfkit.evaluate.geometry.las import CLOUDS, SCANS, las_notes, read_e57, re
 from surfkit.evaluate.geometry.lists import fans, has_lists, points_beside_lists
 from surfkit.evaluate.geometry.place import notes_in, offset_in, place_of, root_of
 from surfkit.io.datasets.sparse_ply import read_points
-from surfkit.io.splats.ply import TYPES, read_vertices
+from surfkit.io.splats.ply import PLY_TYPES, read_vertices
 
-BLOCK = 1 << 20
+BLOCK_POINTS = 1 << 20
 """Points in memory at a time."""
-CORNERS = ("vertex_indices", "vertex_index")
+FACE_PROPERTIES = ("vertex_indices", "vertex_index")
 """Names that PLY files give to the corners of a face."""
-PIECES = 16
+BOX_PIECES = 16
 """Into which the diagonal of a box is cut by faces that reach out of it."""
 
 Blocks = Callable[[], Iterator[np.ndarray]]
@@ -30,7 +30,7 @@ Blocks = Callable[[], Iterator[np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfaceFile:
     """What a file holds: a mesh, or a cloud of points.
 
     Attributes:
@@ -57,8 +57,8 @@ class Surface:
 
     def blocks(self) -> Iterator[np.ndarray]:
         """(n, 3) float64 finite positions of the vertices, block by block."""
-        for start in range(0, len(self), BLOCK):
-            block = self.vertices(slice(start, start + BLOCK))
+        for start in range(0, len(self), BLOCK_POINTS):
+            block = self.vertices(slice(start, start + BLOCK_POINTS))
             yield block[np.isfinite(block).all(1)]
 
 
@@ -87,7 +87,7 @@ def metres_in(path: Path) -> float | None:
     return metres
 
 
-def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
+def part_within(mesh: SurfaceFile, low: np.ndarray, high: np.ndarray) -> SurfaceFile:
     """The faces of a mesh that reach into a box; of those that reach far out of it, pieces.
 
     Args:
@@ -95,9 +95,9 @@ def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
         low: (3,) least coordinates of the box.
         high: (3,) greatest.
     """
-    found, piece = [], float(np.linalg.norm(high - low)) / PIECES
-    for start in range(0, len(mesh.faces), BLOCK):
-        corners = mesh.vertices(np.asarray(mesh.faces[start : start + BLOCK]).ravel()).reshape(-1, 3, 3)
+    found, piece = [], float(np.linalg.norm(high - low)) / BOX_PIECES
+    for start in range(0, len(mesh.faces), BLOCK_POINTS):
+        corners = mesh.vertices(np.asarray(mesh.faces[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
         while len(corners):
             least, most = corners.min(1), corners.max(1)
             touches = ((least <= high) & (most >= low)).all(1)
@@ -108,10 +108,10 @@ def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
             quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
             corners = np.concatenate([np.stack(each, axis=1) for each in quarters])
     corners = np.concatenate(found) if found else np.empty((0, 3, 3))
-    return Surface(mesh.path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    return SurfaceFile(mesh.path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
-def read_surface(path: Path) -> Surface:
+def read_surface(path: Path) -> SurfaceFile:
     """The mesh or cloud in a file: PLY read here, block by block; OBJ, STL, GLB, OFF and text PLY meshes by trimesh;
     LAS, LAZ and E57 by their libraries, and rasters of heights as meshes.
 
@@ -125,9 +125,9 @@ def read_surface(path: Path) -> Surface:
         raise BadInput(f"{path}: no such file; name a mesh or a cloud of points")
     kind = path.suffix.lower()
     if kind in SCANS:
-        found = Surface(path, read_e57(path) if kind == ".e57" else read_las(path)[0])
+        found = SurfaceFile(path, read_e57(path) if kind == ".e57" else read_las(path)[0])
     elif kind in RASTERS:
-        found = Surface(path, *read_heights_raster(path))
+        found = SurfaceFile(path, *read_heights_raster(path))
     else:
         found = _ply(path) if kind == ".ply" else _other(path)
     if not len(found):
@@ -137,7 +137,7 @@ def read_surface(path: Path) -> Surface:
     return _sound(found)
 
 
-def read_mesh(path: Path) -> Surface:
+def read_mesh(path: Path) -> SurfaceFile:
     """The mesh in a file; BadInput for a cloud of points."""
     found = read_surface(path)
     if found.faces is None:
@@ -145,16 +145,18 @@ def read_mesh(path: Path) -> Surface:
     return found
 
 
-def _ply(path: Path) -> Surface:
+def _ply(path: Path) -> SurfaceFile:
     lines = _header(path)
     count = next((int(line.split()[2]) for line in lines if line.startswith("element face ")), None)
     if "format binary_little_endian 1.0" in lines:
         rows = points_beside_lists(path, lines) if count is None and has_lists(lines) else read_vertices(path)[0]
         if not {"x", "y", "z"} <= set(rows.dtype.names or ()):
             raise BadInput(f"{path}: its points lack x, y or z; write the file again")
-        return Surface(path, rows, None if count is None else _faces(path, lines, rows, count), offset_in(path, lines))
+        return SurfaceFile(
+            path, rows, None if count is None else _faces(path, lines, rows, count), offset_in(path, lines)
+        )
     if count is None:
-        return Surface(path, read_points(path)[0])
+        return SurfaceFile(path, read_points(path)[0])
     return _other(path)
 
 
@@ -184,15 +186,20 @@ def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.nda
     ends = [i for i, line in enumerate(lines) if i > begun and line.startswith("element ")]
     fields: list[tuple] = []
     for words in (line.split() for line in lines[begun : ends[0] if ends else None] if line.startswith("property ")):
-        if words[1] == "list" and len(words) == 5 and words[4] in CORNERS and {words[2], words[3]} <= TYPES.keys():
-            fields += [("size", "<" + TYPES[words[2]]), ("corners", "<" + TYPES[words[3]], (3,))]
-        elif len(words) == 3 and words[1] in TYPES:
-            fields.append((words[2], "<" + TYPES[words[1]]))
+        if (
+            words[1] == "list"
+            and len(words) == 5
+            and words[4] in FACE_PROPERTIES
+            and {words[2], words[3]} <= PLY_TYPES.keys()
+        ):
+            fields += [("size", "<" + PLY_TYPES[words[2]]), ("corners", "<" + PLY_TYPES[words[3]], (3,))]
+        elif len(words) == 3 and words[1] in PLY_TYPES:
+            fields.append((words[2], "<" + PLY_TYPES[words[1]]))
         else:
             raise BadInput(f"{path}: cannot read {' '.join(words)!r} of a face; leave it out of the file")
     dtype = np.dtype(fields)
     if "corners" not in (dtype.names or ()):
-        raise BadInput(f"{path}: its faces have no {CORNERS[0]}; write the file again")
+        raise BadInput(f"{path}: its faces have no {FACE_PROPERTIES[0]}; write the file again")
     if not count:
         return np.empty((0, 3), np.int32)
     start = (rows.offset + rows.nbytes) if isinstance(rows, np.memmap) else 0
@@ -208,7 +215,7 @@ def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.nda
     return mapped["corners"]
 
 
-def _other(path: Path) -> Surface:
+def _other(path: Path) -> SurfaceFile:
     with needed("trimesh", f"{path}: a file that is not binary PLY"):
         import trimesh
     try:
@@ -222,13 +229,13 @@ def _other(path: Path) -> Surface:
         raise BadInput(f"{path}: no mesh and no cloud of points in it")
     place = place_of(path, root_of(path))
     vertices = np.asarray(vertices, np.float64) @ place.turn.T + place.offset
-    return Surface(path, vertices, None if faces is None else np.asarray(faces))
+    return SurfaceFile(path, vertices, None if faces is None else np.asarray(faces))
 
 
-def _sound(found: Surface) -> Surface:
+def _sound(found: SurfaceFile) -> SurfaceFile:
     """The same without what is not finite, told by a warning; faces must name vertices that are there."""
-    starts = range(0, len(found), BLOCK)
-    good = [np.isfinite(found.vertices(slice(start, start + BLOCK))).all(1) for start in starts]
+    starts = range(0, len(found), BLOCK_POINTS)
+    good = [np.isfinite(found.vertices(slice(start, start + BLOCK_POINTS))).all(1) for start in starts]
     bad = len(found) - sum(int(part.sum()) for part in good)
     if bad == len(found):
         raise BadInput(f"{found.path}: none of its {bad} points is finite; write the file again")

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CELL = 2.0
+CELL_TAUS = 2.0
 """Of the height map, multiples of tau."""
-MOST_CELLS = 1024
+MAX_MAP_SIDE_CELLS = 1024
 """Of the height map, along each side."""
-STEEPEST = 1.0
+MAX_SLOPE = 1.0
 """Slope between neighbouring cells above which there is a step between them."""
-LOWER = 0.75
+MIN_LOWER_SHARE = 0.75
 """Share of the steps around a connected piece, at which it must be the lower side to be ground."""
-LEAST_PIECE = 0.01
+MIN_CONNECTED_SHARE = 0.01
 """Of all cells: smaller pieces are judged by their height above the ground around them."""
-HIGHEST = 98
+HIGHEST_PERCENTILE = 98
 """Percentile of the heights above ground that stands for the highest."""
 CLEARANCE = 0.05
 """Of that height, up to which a surface still lies on the ground."""
@@ -64,14 +64,14 @@ def terrain(points: np.ndarray, turn: np.ndarray, tau: float) -> Terrain:
 
     placed = points @ turn.T
     corner = placed[:, :2].min(0)
-    cell = max(CELL * tau, float(np.ptp(placed[:, :2], axis=0).max()) / MOST_CELLS)
+    cell = max(CELL_TAUS * tau, float(np.ptp(placed[:, :2], axis=0).max()) / MAX_MAP_SIDE_CELLS)
     at = np.floor((placed[:, :2] - corner) / cell).astype(np.int64)
     lowest = np.full(at.max(0) + 1, np.inf)
     np.minimum.at(lowest, tuple(at.T), placed[:, 2])
     lowest = _filled(lowest, np.isfinite(lowest), ndimage)
     heights = _filled(lowest, _ground(lowest, cell), ndimage)
     found = Terrain(turn, corner, cell, heights, 0.0)
-    highest = float(np.percentile(found.above(points), HIGHEST))
+    highest = float(np.percentile(found.above(points), HIGHEST_PERCENTILE))
     return Terrain(turn, corner, cell, heights, max(2 * tau, CLEARANCE * highest))
 
 
@@ -92,7 +92,7 @@ def _ground(lowest: np.ndarray, cell: float) -> np.ndarray:
     pairs = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:])]
     a, b = (np.concatenate([pair[side].ravel() for pair in pairs]) for side in (0, 1))
     rise = lowest.ravel()[b] - lowest.ravel()[a]
-    flat = np.abs(rise) <= STEEPEST * cell
+    flat = np.abs(rise) <= MAX_SLOPE * cell
     links = csr_matrix((np.ones(flat.sum()), (a[flat], b[flat])), shape=(lowest.size,) * 2)
     count, piece = connected_components(links, directed=False)
     area = np.bincount(piece, minlength=count)
@@ -101,7 +101,7 @@ def _ground(lowest: np.ndarray, cell: float) -> np.ndarray:
     apart = piece[low] != piece[high]
     lower, upper = (np.bincount(piece[side[apart]], minlength=count) for side in (low, high))
     share = (lower + 1) / (lower + upper + 1)  # 1 for a piece with no step around it
-    ground = (area >= LEAST_PIECE * lowest.size) & (share >= LOWER)
+    ground = (area >= MIN_CONNECTED_SHARE * lowest.size) & (share >= MIN_LOWER_SHARE)
     if not ground.any():
         ground[np.argmax(area * share)] = True
     return ground[piece].reshape(lowest.shape)

@@ -9,11 +9,11 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import Blocks
 
-BITS = 21
+VOXEL_INDEX_BITS = 21
 """Of a voxel's index along each axis, so that all three fit into one integer."""
 MERGE_AT = 1 << 20
 """Voxels that wait to be merged, at least."""
-COARSE, SPARSE = 512, 0.2
+COARSE_VOXELS, MAX_SPARSE_SHARE = 512, 0.2
 """Voxels along the diagonal by which the area of a large cloud is estimated; larger ones where more than such a share
 of the points has a voxel of its own."""
 
@@ -48,19 +48,19 @@ def bounds(blocks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def voxel_for(blocks: Blocks, most: int) -> float:
     """Edge of voxels of which about `most` would have points: a surface fills them with the inverse square of it."""
     low, high = bounds(blocks())
-    coarse = max(float(np.linalg.norm(high - low)) / COARSE, 1e-12)
+    coarse = max(float(np.linalg.norm(high - low)) / COARSE_VOXELS, 1e-12)
     count = sum(len(block) for block in blocks())
-    while (filled := len(thin(blocks(), coarse, low))) > max(1, SPARSE * count):
+    while (filled := len(thin(blocks(), coarse, low))) > max(1, MAX_SPARSE_SHARE * count):
         coarse *= 2
     return coarse * (filled / most) ** 0.5
 
 
 def _keys(points: np.ndarray, voxel: float, origin: np.ndarray) -> np.ndarray:
     at = np.floor((points - origin) / voxel)
-    if len(at) and np.abs(at).max() >= 1 << (BITS - 1):
+    if len(at) and np.abs(at).max() >= 1 << (VOXEL_INDEX_BITS - 1):
         raise BadInput(f"voxels of {voxel:g} are too small for points that lie {np.ptp(points, axis=0).max():g} apart")
-    at = at.astype(np.int64) + (1 << (BITS - 1))
-    return (at[:, 0] << 2 * BITS) | (at[:, 1] << BITS) | at[:, 2]
+    at = at.astype(np.int64) + (1 << (VOXEL_INDEX_BITS - 1))
+    return (at[:, 0] << 2 * VOXEL_INDEX_BITS) | (at[:, 1] << VOXEL_INDEX_BITS) | at[:, 2]
 
 
 def _grouped(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,9 +11,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 
-NAMES = ("transform", "transformation", "matrix", "trans")
+MATRIX_KEYS = ("transform", "transformation", "matrix", "trans")
 """Keys under which JSON files hold a matrix."""
-TOLERANCE = 1e-3
+MAX_SIMILARITY_ERROR = 1e-3
 """By which a matrix may miss being a turn times a size."""
 
 
@@ -74,10 +74,10 @@ def _from_json(path: Path) -> object:
     data = read_json(path, Any)
     if not isinstance(data, dict):
         return data
-    found = [name for name in NAMES if name in data]
+    found = [name for name in MATRIX_KEYS if name in data]
     if not found:
         raise BadInput(
-            f"{path}: no matrix in it under {', '.join(NAMES)}; its keys: {', '.join(map(str, data)) or 'none'}"
+            f"{path}: no matrix in it under {', '.join(MATRIX_KEYS)}; its keys: {', '.join(map(str, data)) or 'none'}"
         )
     return data[found[0]]
 
@@ -87,7 +87,7 @@ def _similarity(path: Path, matrix: np.ndarray) -> np.ndarray:
     if not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]) or np.linalg.det(linear) <= 0:
         raise BadInput(f"{path}: no transform: it must be finite, not mirror, and end with the row 0 0 0 1")
     turn = linear / scale_of(matrix)
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=TOLERANCE):
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=MAX_SIMILARITY_ERROR):
         raise BadInput(f"{path}: it shears or stretches; only turns, shifts and one change of size are allowed")
     return matrix
 

@@ -10,14 +10,14 @@ from surfkit.core.events import Progress, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
-LONGEST_PX = 800
+DEPTH_LONGEST_PX = 800
 """Of the depth maps, whatever size was trained on: the volume depends on the cameras alone."""
-COVER = 2.0
+SQUARE_GAPS = 2.0
 """A point covers a square of this many gaps between points: of points strewn at random, 2 % leave a hole then."""
-BEHIND = 3.0
+MAX_WIDTHS_BEHIND = 3.0
 """Widths of such a square, or of a pixel, by which a point may lie behind the nearest one and still be seen: surfaces
 that are turned away by up to 63 degrees hide nothing of themselves."""
-SIDES = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024])
+SQUARE_SIDES_PX = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024])
 """Of the squares, pixels."""
 
 
@@ -35,7 +35,7 @@ def visible_counts(points: np.ndarray, views: Sequence[View], frame: Frame, gap:
     """
     counts = np.zeros(len(points), np.int32)
     for done, view in enumerate(views, 1):
-        camera = view.camera.sized(LONGEST_PX)
+        camera = view.camera.sized(DEPTH_LONGEST_PX)
         at, seen = visible(points, camera, frame.input_pose(camera.world_to_camera), gap)
         counts[at[seen]] += 1
         emit(Progress("counting the views of each point", done, len(views)))
@@ -61,7 +61,7 @@ def cloud_depth(
     """(H, W) depth of the nearest point at each pixel, inf where there is none, and what `project` says of them."""
     spots = project(points, camera, pose)
     _, x, y, z = spots
-    side = sides(COVER * gap * max(camera.fx, camera.fy) / z)
+    side = sides(SQUARE_GAPS * gap * max(camera.fx, camera.fy) / z)
     return nearest_rows(x, y, z, side, (camera.height, camera.width))[0], spots
 
 
@@ -75,12 +75,12 @@ def not_hidden(depth: np.ndarray, spots: tuple[np.ndarray, ...], gap: float, cam
         camera: Of the map.
     """
     _, x, y, z = spots
-    return z <= depth[y, x] + BEHIND * np.maximum(COVER * gap, z / max(camera.fx, camera.fy))
+    return z <= depth[y, x] + MAX_WIDTHS_BEHIND * np.maximum(SQUARE_GAPS * gap, z / max(camera.fx, camera.fy))
 
 
 def sides(cover_px: np.ndarray) -> np.ndarray:
     """(n,) int64 sides of squares that are at least (n,) `cover_px` wide, or as wide as squares get."""
-    return SIDES[np.searchsorted(SIDES, cover_px).clip(max=len(SIDES) - 1)]
+    return SQUARE_SIDES_PX[np.searchsorted(SQUARE_SIDES_PX, cover_px).clip(max=len(SQUARE_SIDES_PX) - 1)]
 
 
 def project(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, ...]:

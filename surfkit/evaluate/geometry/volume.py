@@ -11,13 +11,13 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
-from surfkit.evaluate.geometry.surface import BLOCK, Surface
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS, SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.visibility import visible_counts
 from surfkit.scene.crop import PLANES, Axis, Crop, within
 from surfkit.scene.scene import Frame, View
 
-RADIUS = 0.02
+ALPHA_RADIUS_SHARE = 0.02
 """Of the alpha shape, as a share of the diagonal of the visible ground: half of the paper's 50 m on a square kilometre,
 as holes are filled here."""
 
@@ -65,12 +65,12 @@ def visible_crop(
         )
     along = kept[:, "xyz".index(settings.axis)]
     ground = kept[:, list(PLANES[settings.axis])]
-    radius = settings.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
+    radius = settings.radius or max(ALPHA_RADIUS_SHARE * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
     low, high = float(along.min()) - settings.margin, float(along.max()) + settings.margin
     return Crop(outline(ground, radius), low, high, settings.axis), len(kept)
 
 
-def heightened(crop: Crop, reconstruction: Surface, matrix: np.ndarray, room: float) -> Crop:
+def heightened(crop: Crop, reconstruction: SurfaceFile, matrix: np.ndarray, room: float) -> Crop:
     """The volume as high and as deep as a reconstruction reaches above and below the polygon.
 
     Else nobody would see a false surface below the truth, or above it. What lies farther away than the volume is wide,
@@ -92,7 +92,7 @@ def heightened(crop: Crop, reconstruction: Surface, matrix: np.ndarray, room: fl
     return replace(crop, low=low - room * (low < crop.low), high=high + room * (high > crop.high))
 
 
-def outside_shares(reconstruction: Surface, matrix: np.ndarray, crop: Crop) -> dict[str, float]:
+def outside_shares(reconstruction: SurfaceFile, matrix: np.ndarray, crop: Crop) -> dict[str, float]:
     """Shares of a reconstruction that lie outside of a volume: above it, below it, and beside it.
 
     Of the area of a mesh, each triangle by its centre, or of the points of a cloud.
@@ -114,13 +114,13 @@ def outside_shares(reconstruction: Surface, matrix: np.ndarray, crop: Crop) -> d
     return {name: share / whole if whole else 0.0 for name, share in found.items()}
 
 
-def _weighted(surface: Surface) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _weighted(surface: SurfaceFile) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """(n, 3) places and (n,) weights: centres and areas of triangles, or points that weigh the same."""
     if surface.faces is None:
         yield from ((block, np.ones(len(block))) for block in surface.blocks())
         return
-    for start in range(0, len(surface.faces), BLOCK):
-        corners = surface.vertices(np.asarray(surface.faces[start : start + BLOCK]).ravel()).reshape(-1, 3, 3)
+    for start in range(0, len(surface.faces), BLOCK_POINTS):
+        corners = surface.vertices(np.asarray(surface.faces[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         yield corners.mean(1), np.linalg.norm(normals, axis=1) / 2
 

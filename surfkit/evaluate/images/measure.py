@@ -25,7 +25,7 @@ Show = Callable[[View, Tensor, Maps], None]
 """Gets a view, its photograph as (3, H, W) uint8 and its render."""
 
 
-class Pictures(Protocol):
+class HeldOutPhotos(Protocol):
     """Photographs by the position of their view."""
 
     def __getitem__(self, at: int, /) -> Tensor:
@@ -58,7 +58,7 @@ def color_corrected(render: Tensor, photo: Tensor, mask: Tensor | None = None) -
 
 def evaluate_views(
     views: Sequence[View],
-    photos: Pictures,
+    photos: HeldOutPhotos,
     draw: Draw,
     *,
     timed: Draw | None = None,

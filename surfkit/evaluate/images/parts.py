@@ -16,7 +16,7 @@ from surfkit.raster.psnr import psnr
 
 Masks = dict[str, Tensor]
 """(H, W) bool of each part, by its name."""
-FEWEST = 64
+MIN_PART_PIXELS = 64
 """Pixels of a photograph that a figure is taken of."""
 
 
@@ -53,7 +53,7 @@ def measure_parts(
             mask = mask if keep is None else mask & keep
             into = sums.setdefault(name, {"pixels": 0, "counted": 0, "psnr": 0.0, "ssim": 0.0})
             into["pixels"] += (count := int(mask.sum()))
-            if count >= FEWEST:
+            if count >= MIN_PART_PIXELS:
                 into["counted"] += count
                 into["psnr"] += count * psnr(render, target, mask)
                 into["ssim"] += count * mean_ssim(render, target, mask)

@@ -15,7 +15,7 @@ from surfkit.raster.psnr import psnr
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import View
 
-MOST = 3
+MAX_PROGRESS_VIEWS = 3
 """Views that are looked at."""
 
 
@@ -28,7 +28,7 @@ class ProgressPictures:
     """
 
     def __init__(self, folder: Path, views: Sequence[View]) -> None:
-        count = min(MOST, len(views))
+        count = min(MAX_PROGRESS_VIEWS, len(views))
         self.folder = folder
         self.views = [views[i * len(views) // count] for i in range(count)]
         self.photos: Sequence[Tensor] | None = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.evaluate.geometry.scores import WORKERS, tree
-from surfkit.evaluate.geometry.surface import BLOCK
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Seams:
         if not len(self.borders):
             return found
         there = tree(self.borders)
-        for start in range(0, len(points), BLOCK):
-            part = slice(start, start + BLOCK)
+        for start in range(0, len(points), BLOCK_POINTS):
+            part = slice(start, start + BLOCK_POINTS)
             flat = np.asarray(points[part], np.float64) @ self.ground.T
             found[part] = np.isfinite(there.query(flat, distance_upper_bound=self.reach, workers=WORKERS)[0])
         return found

@@ -13,12 +13,12 @@ from surfkit.core.events import Progress, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
-LONGEST_PX = 800
+COMPARED_LONGEST_PX = 800
 """Of the depth maps that are compared; larger photographs are looked at so."""
-BYTES = 512 << 20
+BATCH_BYTES = 512 << 20
 """Of the places that pixels show, in memory at a time; for more photographs, training views are drawn again."""
 PLACE_BYTES = 16
-PIXELS = 2.0
+DEPTH_SLACK_PX = 2.0
 """Widths of a pixel by which depths may differ."""
 
 DepthOf = Callable[[View], Tensor]
@@ -26,7 +26,7 @@ DepthOf = Callable[[View], Tensor]
 
 
 @dataclass(frozen=True)
-class Depths:
+class DepthSource:
     """Where depth comes from, and when two views show the same place.
 
     Attributes:
@@ -63,7 +63,7 @@ class ViewCounts:
         return torch.nn.functional.interpolate(mask[None, None].float(), size=size, mode="nearest")[0, 0] > 0.5
 
 
-def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> Iterator[ViewCounts]:
+def count_views(held_out: Sequence[View], train: Sequence[View], depths: DepthSource) -> Iterator[ViewCounts]:
     """What each held-out photograph shows, and how many training views see it.
 
     A place counts as seen if it lies in a training view's picture, and the depth there, of the nearest pixel or between
@@ -76,7 +76,7 @@ def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths)
     """
     sizes = [PLACE_BYTES * reduced(view).camera.width * reduced(view).camera.height for view in held_out]
     batches: list[list[View]] = []
-    for view, at in zip(held_out, np.cumsum(sizes) // BYTES, strict=True):
+    for view, at in zip(held_out, np.cumsum(sizes) // BATCH_BYTES, strict=True):
         while len(batches) <= at:
             batches.append([])
         batches[at].append(view)
@@ -94,7 +94,7 @@ def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths)
 
 def reduced(view: View) -> View:
     """The view at the size at which depths are compared."""
-    return replace(view, camera=view.camera.fitted(LONGEST_PX))
+    return replace(view, camera=view.camera.fitted(COMPARED_LONGEST_PX))
 
 
 def _places(view: View, depth_of: DepthOf) -> tuple[Tensor, Tensor]:
@@ -107,7 +107,7 @@ def _places(view: View, depth_of: DepthOf) -> tuple[Tensor, Tensor]:
     return places.float(), torch.zeros(depth.shape, dtype=torch.int32)
 
 
-def _seen(places: Tensor, camera: Camera, depth: Tensor, depths: Depths) -> Tensor:
+def _seen(places: Tensor, camera: Camera, depth: Tensor, depths: DepthSource) -> Tensor:
     """(h, w) bool: which places a training view sees.
 
     On a plane, the inverse depth is linear in the picture: between pixels it is exact there.
@@ -119,7 +119,7 @@ def _seen(places: Tensor, camera: Camera, depth: Tensor, depths: Depths) -> Tens
     depth = depth.cpu().float()
     inverse = torch.where((depth > 0) & depth.isfinite(), 1 / depth, 0.0)[None, None]
     at = torch.stack([2 * x / camera.width - 1, 2 * y / camera.height - 1], -1)[None].nan_to_num(-2.0).clamp(-2, 2)
-    slack = max(depths.tolerance, PIXELS / max(camera.fx, camera.fy))
+    slack = max(depths.tolerance, DEPTH_SLACK_PX / max(camera.fx, camera.fy))
     agrees = torch.zeros_like(inside)
     for way in ("nearest", "bilinear"):
         ratio = (

@@ -7,23 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import BLOCK
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS
 from surfkit.evaluate.mesh.whole import WholeMesh
 
-MOST = 1 << 20
+MAX_CUBES_PER_AXIS = 1 << 20
 """Cubes along an axis, so that the number of a cube fits 64 bits."""
 GOLDEN = 0.6180339887498949
 """The golden section, multiples of which spread most evenly between whole numbers."""
-PARTS = 4
+PARTS_PER_SIDE = 4
 """Into which the side of a cube is cut where vertices near it are looked for."""
 PRIMES = np.array([73856093, 19349663, 83492791])
 """Of a spatial hash (Teschner et al. 2003, Optimized spatial hashing for collision detection of deformable objects)."""
-PLACES = 1 << 24
+HASH_TABLE_SIZE = 1 << 24
 """Of the table of that hash; two cells in one place cost time only."""
 
 
 @dataclass(frozen=True)
-class Box:
+class MeshCube:
     """A cube, and the faces of the mesh that reach into it or near it.
 
     Attributes:
@@ -43,7 +43,7 @@ class Box:
         return ((points >= self.low) & (points < self.high)).all(-1)
 
 
-def boxes(mesh: WholeMesh, side: float, chosen: np.ndarray, margin: float = 0.0) -> list[Box]:
+def boxes(mesh: WholeMesh, side: float, chosen: np.ndarray, margin: float = 0.0) -> list[MeshCube]:
     """The cubes of a lattice that some faces of a mesh have their middle in.
 
     Args:
@@ -53,12 +53,12 @@ def boxes(mesh: WholeMesh, side: float, chosen: np.ndarray, margin: float = 0.0)
         margin: Around a cube, from which faces are given as well.
     """
     origin, top = mesh.places.min(0).astype(np.float64), mesh.places.max(0).astype(np.float64)
-    side = max(side, float((top - origin).max()) / MOST * 1.01)
+    side = max(side, float((top - origin).max()) / MAX_CUBES_PER_AXIS * 1.01)
     middles = mesh.corners(chosen).mean(1)
     cells, counts = np.unique(((middles - origin) // side).astype(np.int64).clip(0), axis=0, return_counts=True)
     lows = origin + cells * side
     found = _touching(mesh, lows - margin, lows + (side + margin), _near(mesh.places, cells, origin, side, margin))
-    return [Box(low, low + side, *each) for low, *each in zip(lows, found, counts.tolist(), strict=True)]
+    return [MeshCube(low, low + side, *each) for low, *each in zip(lows, found, counts.tolist(), strict=True)]
 
 
 def by_number(mesh: WholeMesh, count: int) -> np.ndarray:
@@ -89,8 +89,8 @@ def _touching(mesh: WholeMesh, low: np.ndarray, high: np.ndarray, near: tuple[np
     """
     found: list[list[np.ndarray]] = [[] for _ in low]
     is_near, reach = near
-    for start in range(0, len(mesh.faces), BLOCK):
-        part = slice(start, start + BLOCK)
+    for start in range(0, len(mesh.faces), BLOCK_POINTS):
+        part = slice(start, start + BLOCK_POINTS)
         rows = start + np.flatnonzero(is_near[mesh.faces[part, 0]] | (mesh.extents[part] > reach))
         corners = mesh.corners(rows)
         least, most = corners.min(1).T.copy(), corners.max(1).T.copy()
@@ -109,15 +109,15 @@ def _near(
 
     Space is cut into cubes of the size of the reach, and a table says which of them are near a cell.
     """
-    reach = side / PARTS
+    reach = side / PARTS_PER_SIDE
     around = 1 + math.ceil(margin / reach)
-    steps = np.arange(-around, PARTS + around)
+    steps = np.arange(-around, PARTS_PER_SIDE + around)
     cubes = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    table = np.zeros(PLACES, bool)
-    table[_hash((cells[:, None] * PARTS + cubes).reshape(-1, 3))] = True
+    table = np.zeros(HASH_TABLE_SIZE, bool)
+    table[_hash((cells[:, None] * PARTS_PER_SIDE + cubes).reshape(-1, 3))] = True
     found = np.empty(len(places), bool)
-    for start in range(0, len(places), BLOCK):
-        part = slice(start, start + BLOCK)
+    for start in range(0, len(places), BLOCK_POINTS):
+        part = slice(start, start + BLOCK_POINTS)
         found[part] = table[_hash(((places[part] - origin) // reach).astype(np.int64))]
     return found, reach * (1 - 1e-6)  # coordinates are rounded
 
@@ -125,4 +125,4 @@ def _near(
 def _hash(cells: np.ndarray) -> np.ndarray:
     """(n,) place in the table of each of (n, 3) cells."""
     x, y, z = (cells * PRIMES).T
-    return (x ^ y ^ z) & (PLACES - 1)
+    return (x ^ y ^ z) & (HASH_TABLE_SIZE - 1)

@@ -11,17 +11,17 @@ import numpy as np
 from surfkit.evaluate.mesh.boxes import boxes, by_number
 from surfkit.evaluate.mesh.whole import WholeMesh
 
-WHOLE = 1_000_000
+MAX_WHOLE_TRIANGLES = 1_000_000
 """Triangles of a mesh that is measured whole: 7 s of CPU time."""
-BOXES = 48
+SAMPLED_CUBES = 48
 """Cubes that are measured of a larger one."""
-IN_BOX = 10_000
+TRIANGLES_PER_CUBE = 10_000
 """Triangles in a cube that one sheet of surface goes straight through."""
-LEAST = 0.01
+MIN_MEAN_AREA_SHARE = 0.01
 """Of the mean area of a triangle, by which the median counts at least: slivers may be more than half."""
 PAIRS = 1 << 20
 """Pairs of triangles in memory at a time."""
-CELLS = 1 << 20
+GRID_CELLS_PER_AXIS = 1 << 20
 """Of a grid, along an axis."""
 
 
@@ -56,12 +56,12 @@ def crossings(mesh: WholeMesh) -> Crossings:
         mesh: Any.
     """
     total = len(mesh.faces)
-    if total <= WHOLE:
+    if total <= MAX_WHOLE_TRIANGLES:
         crossing = int(crossing_faces(mesh, np.arange(total)).sum())
         return Crossings(crossing / total, crossing, total)
-    side = float(np.sqrt(IN_BOX * max(np.median(mesh.areas), mesh.area / total * LEAST)))
+    side = float(np.sqrt(TRIANGLES_PER_CUBE * max(np.median(mesh.areas), mesh.area / total * MIN_MEAN_AREA_SHARE)))
     crossing, measured, chosen = [], [], []
-    for box in boxes(mesh, side, by_number(mesh, BOXES)):
+    for box in boxes(mesh, side, by_number(mesh, SAMPLED_CUBES)):
         within = box.has(mesh.corners(box.faces)).all(1)
         if within.any():
             crossing.append(int((crossing_faces(mesh, box.faces) & within).sum()))
@@ -121,7 +121,7 @@ def _near_pairs(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray,
         high: (n, 3) greatest.
     """
     extent, origin = (high - low).max(1), low.min(0)
-    base = max(float(np.median(extent)), float((high - origin).max()) / CELLS, 1e-300)
+    base = max(float(np.median(extent)), float((high - origin).max()) / GRID_CELLS_PER_AXIS, 1e-300)
     level = np.ceil(np.log2((extent / base).clip(1))).astype(np.int64)
     for each in np.unique(level):
         size = base * 2.0**each
@@ -178,4 +178,4 @@ def _joined(
 
 def _cell(places: np.ndarray) -> np.ndarray:
     """(n,) int64 number of each of (n, 3) cells."""
-    return (places[:, 0] * (2 * CELLS) + places[:, 1]) * (2 * CELLS) + places[:, 2]
+    return (places[:, 0] * (2 * GRID_CELLS_PER_AXIS) + places[:, 1]) * (2 * GRID_CELLS_PER_AXIS) + places[:, 2]

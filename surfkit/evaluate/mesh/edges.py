@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import BLOCK
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS
 from surfkit.evaluate.mesh.whole import WholeMesh
 
 
@@ -59,8 +59,8 @@ def boundary_edges(mesh: WholeMesh) -> tuple[np.ndarray, int]:
 def sorted_sides(faces: np.ndarray) -> np.ndarray:
     """(3 F,) int64 sides of (F, 3) faces in order: the lower vertex in the upper 32 bits, the higher in the lower."""
     found = np.empty(3 * len(faces), np.int64)
-    for start in range(0, len(faces), BLOCK):
-        corners = faces[start : start + BLOCK].astype(np.int64)
+    for start in range(0, len(faces), BLOCK_POINTS):
+        corners = faces[start : start + BLOCK_POINTS].astype(np.int64)
         others = np.roll(corners, -1, 1)
         sides = np.minimum(corners, others) << 32 | np.maximum(corners, others)
         found[3 * start : 3 * start + sides.size] = sides.ravel()

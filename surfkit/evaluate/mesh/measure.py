@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import Surface, metres_in
+from surfkit.evaluate.geometry.surface import SurfaceFile, metres_in
 from surfkit.evaluate.mesh.crossing import crossings
 from surfkit.evaluate.mesh.edges import connections
 from surfkit.evaluate.mesh.roughness import Roughness, radius_for, roughness
@@ -30,7 +30,7 @@ class MeshMeasure:
     metres: float | None
 
 
-def measure_mesh(mesh: Surface, metres: float | None = None) -> MeshMeasure:
+def measure_mesh(mesh: SurfaceFile, metres: float | None = None) -> MeshMeasure:
     """Measure a mesh without any truth; a mesh of 17 million triangles takes about 25 s of CPU time and 2.5 GB.
 
     Args:

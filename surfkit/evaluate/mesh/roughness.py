@@ -16,22 +16,22 @@ import numpy as np
 from surfkit.evaluate.geometry.sampling import sample_surface
 from surfkit.evaluate.geometry.scores import tree
 from surfkit.evaluate.geometry.surface import part_within
-from surfkit.evaluate.mesh.boxes import Box, boxes, by_area
+from surfkit.evaluate.mesh.boxes import MeshCube, boxes, by_area
 from surfkit.evaluate.mesh.whole import WholeMesh
 
-RADIUS_M = 1.0
+BALL_RADIUS_M = 1.0
 """Of the balls, where the length of a unit is known: of planes of buildings there is much, of details little."""
-SHARE = 1 / 200
+BALL_RADIUS_SHARE = 1 / 200
 """Radius where it is not, as a share of the square root of the area of the mesh."""
-BOXES, SIDE = 128, 6.0
+MAX_CUBES, CUBE_SIDE_RADII = 128, 6.0
 """Cubes that are measured, and the side of one in radii."""
-IN_BALL = 64
+POINTS_PER_BALL = 64
 """Points in a ball that one plane goes through the middle of."""
-PLACES, MOST = 64, 200_000
+PLACES_PER_CUBE, MAX_CUBE_POINTS = 64, 200_000
 """In a cube: places at which roughness is measured, each time that it was chosen, and points of the surface."""
-LEAST = 10
+MIN_BALL_POINTS = 10
 """Points in a ball, without which nothing is measured."""
-PLANE = 0.1
+MAX_FLAT_ROUGHNESS = 0.1
 """Roughness, in radii, up to which a place counts as one of a plane: noise of a tenth of a metre in a ball of a metre
 does; an edge of a roof, with 0.3 and more, does not."""
 
@@ -58,7 +58,7 @@ class Roughness:
     @property
     def is_plane(self) -> np.ndarray:
         """(n,) bool, which places lie on planes of the mesh."""
-        return self.values <= PLANE * self.radius
+        return self.values <= MAX_FLAT_ROUGHNESS * self.radius
 
 
 def median_of(values: np.ndarray) -> float | None:
@@ -73,8 +73,8 @@ def radius_for(mesh: WholeMesh, metres: float | None) -> float:
     ten, so that meshes of the same scene have the same.
     """
     if metres is not None:
-        return RADIUS_M / metres
-    wanted = SHARE * math.sqrt(mesh.area)
+        return BALL_RADIUS_M / metres
+    wanted = BALL_RADIUS_SHARE * math.sqrt(mesh.area)
     power = 10.0 ** math.floor(math.log10(wanted))
     return min((step * power for step in (1, 2, 5, 10)), key=lambda radius: abs(math.log(radius / wanted)))
 
@@ -86,13 +86,13 @@ def roughness(mesh: WholeMesh, radius: float) -> Roughness:
     """
     found = [
         _in_box(mesh, box, radius, np.random.default_rng([at]))
-        for at, box in enumerate(boxes(mesh, SIDE * radius, by_area(mesh, BOXES), radius))
+        for at, box in enumerate(boxes(mesh, CUBE_SIDE_RADII * radius, by_area(mesh, MAX_CUBES), radius))
     ]
     places, values = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return Roughness(radius, places, values)
 
 
-def _in_box(mesh: WholeMesh, box: Box, radius: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _in_box(mesh: WholeMesh, box: MeshCube, radius: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) places in a cube, and (n,) roughness there."""
     low, high = box.low - radius, box.high + radius
     part = part_within(mesh.part(box.faces), low, high)
@@ -100,10 +100,10 @@ def _in_box(mesh: WholeMesh, box: Box, radius: float, draw: np.random.Generator)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     if not area > 0:
         return np.empty((0, 3)), np.empty(0)
-    count = min(math.ceil(area * IN_BALL / (math.pi * radius**2)), MOST)
+    count = min(math.ceil(area * POINTS_PER_BALL / (math.pi * radius**2)), MAX_CUBE_POINTS)
     points = sample_surface(part, count, draw)
     inner = points[box.has(points)]
-    places = inner[:: max(1, len(inner) // (PLACES * box.chosen))]
+    places = inner[:: max(1, len(inner) // (PLACES_PER_CUBE * box.chosen))]
     values = residuals(points, places, radius)
     known = np.isfinite(values)
     return places[known], values[known]
@@ -118,7 +118,7 @@ def residuals(points: np.ndarray, places: np.ndarray, radius: float) -> np.ndarr
         return np.full(len(places), np.nan)
     rows = tree(points).query_ball_point(places, radius, return_sorted=False)
     counts = np.array([len(row) for row in rows])
-    enough = np.flatnonzero(counts >= LEAST)
+    enough = np.flatnonzero(counts >= MIN_BALL_POINTS)
     found = np.full(len(places), np.nan)
     if not len(enough):
         return found

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import BLOCK, Surface
+from surfkit.evaluate.geometry.surface import BLOCK_POINTS, SurfaceFile
 from surfkit.scene.same_places import first_in_place
 
 
@@ -39,12 +39,12 @@ class WholeMesh:
         """(n, 3, 3) float64 corners of some faces."""
         return self.places[self.faces[faces]].astype(np.float64)
 
-    def part(self, faces: np.ndarray) -> Surface:
+    def part(self, faces: np.ndarray) -> SurfaceFile:
         """Some faces as a surface of their own, each with its own vertices."""
-        return Surface(self.path, self.corners(faces).reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
+        return SurfaceFile(self.path, self.corners(faces).reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
 
 
-def whole_mesh(mesh: Surface) -> WholeMesh:
+def whole_mesh(mesh: SurfaceFile) -> WholeMesh:
     """The mesh in memory: about 70 bytes for a triangle of a closed mesh of float32.
 
     Files of other programs repeat vertices, for each face (STL) or along seams of a texture: those in one place are
@@ -58,8 +58,8 @@ def whole_mesh(mesh: Surface) -> WholeMesh:
     faces = np.empty((len(mesh.faces), 3), np.int32)
     areas, extents = np.empty(len(faces), np.float32), np.empty(len(faces), np.float32)
     count = 0
-    for start in range(0, len(faces), BLOCK):
-        block = np.asarray(mesh.faces[start : start + BLOCK])
+    for start in range(0, len(faces), BLOCK_POINTS):
+        block = np.asarray(mesh.faces[start : start + BLOCK_POINTS])
         block = block if stands_for is None else stands_for[block]
         a, b, c = block.T
         block = block[(a != b) & (b != c) & (c != a)]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from surfkit.core.registry import Component
-from surfkit.io.datasets.capture import Capture, Tracks
+from surfkit.io.datasets.capture import RawDataset, Tracks
 from surfkit.io.datasets.data import Data
 
 
@@ -25,7 +25,7 @@ class Reader(Component):
         """Whether a folder looks like this layout, whole or damaged."""
 
     @abstractmethod
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         """What is in the folder `data.path`.
 
         What is wrong with one photograph, or can be gone on after, goes through `core.check.reject` or `leaving_out`:

@@ -19,7 +19,7 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import MOST_PX, Brown, Lenses
+from surfkit.io.datasets.brown import MAX_DIFFERENCE_PX, Brown, LensTable
 from surfkit.io.datasets.camera_files import (
     groups_of,
     leave_out,
@@ -29,18 +29,18 @@ from surfkit.io.datasets.camera_files import (
     pose_at,
     tracks_of,
 )
-from surfkit.io.datasets.capture import Capture, Shot, Tracks
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.exchanged import map_system, photo_names
 from surfkit.io.datasets.transforms import points
 
-HEAD = 4096
+SNIFFED_BYTES = 4096
 """Bytes of a file that are looked at to recognise it."""
-CHUNK = 1 << 20
+CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at once."""
-CENTRE = 0.5
+FIRST_PIXEL_CENTRE = 0.5
 """Of the first pixel, from the corner of the picture; it is at 0 in the file."""
-SIDES = {"Right": (1.0, 0.0), "Left": (-1.0, 0.0), "Down": (0.0, 1.0), "Up": (0.0, -1.0)}
+SIDE_DIRECTIONS = {"Right": (1.0, 0.0), "Left": (-1.0, 0.0), "Down": (0.0, 1.0), "Up": (0.0, -1.0)}
 """Directions in the picture: right and down."""
 MATRIX = tuple(f"M_{row}{column}" for row in range(3) for column in range(3))
 ANGLES = ("Omega", "Phi", "Kappa")
@@ -53,12 +53,12 @@ class BlocksExchange(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         block = _Block.read(data)
         shots, seen = block.shots(data), block.seen()
         crs, metres = block.place()
         xyz, rgb = (block.xyz, block.rgb) if len(block.xyz) else points(data.path, {})
-        return Capture(shots, xyz, rgb, metres=metres, crs=crs, groups=groups_of(shots, seen))
+        return RawDataset(shots, xyz, rgb, metres=metres, crs=crs, groups=groups_of(shots, seen))
 
     def tracks(self, data: Data) -> Tracks | None:
         block = _Block.read(data)
@@ -152,7 +152,7 @@ class _Block:
             return found
         if not tree.xyz:
             return found
-        pixels = np.array([sight[2:] for sight in tree.sights], np.float64).reshape(-1, 2) + CENTRE
+        pixels = np.array([sight[2:] for sight in tree.sights], np.float64).reshape(-1, 2) + FIRST_PIXEL_CENTRE
         return replace(
             found,
             xyz=np.array(tree.xyz),
@@ -162,9 +162,9 @@ class _Block:
             seers=[sight[1] for sight in tree.sights],
         )
 
-    def shots(self, data: Data) -> list[Shot]:
+    def shots(self, data: Data) -> list[RawImage]:
         """The photographs that have a lens and a pose."""
-        found, shots, lenses = photographs(data, self.names), [], Lenses(self.path)
+        found, shots, lenses = photographs(data, self.names), [], LensTable(self.path)
         made, used = {}, {group for _, group in self.photos}
         for at, group in enumerate(self.block.iterfind("Photogroups/Photogroup"), 1):
             if group in used:
@@ -177,7 +177,7 @@ class _Block:
             if name in found and group in made:
                 with leaving_out():
                     axes, camera = made[group]
-                    shots.append(Shot(name, _pose(f"{self.path}: {name!r}", photo, axes), camera, found[name]))
+                    shots.append(RawImage(name, _pose(f"{self.path}: {name!r}", photo, axes), camera, found[name]))
         return shots
 
     def seen(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -213,14 +213,14 @@ class _Block:
                 raise BadInput(f"{where}: no FocalLengthPixels, and no SensorSize either; export the block again")
             focal = _number(where, group, "FocalLength") / pixel
         if group.find("PrincipalPoint/x") is not None:
-            centre = [_number(where, group, f"PrincipalPoint/{axis}") + CENTRE for axis in "xy"]
+            centre = [_number(where, group, f"PrincipalPoint/{axis}") + FIRST_PIXEL_CENTRE for axis in "xy"]
         elif group.find("PrincipalPoint/xmm") is not None:
             if not pixel > 0:
                 raise BadInput(f"{where}: a principal point in millimetres, and no SensorSize; export the block again")
             off = [_number(where, group, f"PrincipalPoint/{axis}mm") for axis in "xy"]
             centre = [middle + shift / pixel for middle, shift in zip(centre, off @ axes[:2, :2], strict=True)]
         aspect, skew = (_number(where, group, name, by) for name, by in (("AspectRatio", 1.0), ("Skew", 0.0)))
-        if max(abs(aspect - 1), abs(skew)) * longer / 2 > MOST_PX:
+        if max(abs(aspect - 1), abs(skew)) * longer / 2 > MAX_DIFFERENCE_PX:
             raise BadInput(
                 f"{where}: AspectRatio {aspect:g} and Skew {skew:g}, which programs write in different ways; optimise "
                 "the cameras without them, or use undistorted photographs"
@@ -239,7 +239,7 @@ def _files(root: Path) -> list[Path]:
 def _is_blocks(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return b"<BlocksExchange" in file.read(HEAD)
+            return b"<BlocksExchange" in file.read(SNIFFED_BYTES)
     except OSError:
         return False
 
@@ -249,7 +249,7 @@ def _parse(path: Path) -> tuple[ElementTree.Element, _Tree]:
     parser = ElementTree.XMLParser(target=tree)
     try:
         with path.open("rb") as file:
-            while part := file.read(CHUNK):
+            while part := file.read(CHUNK_BYTES):
                 parser.feed(part)
         root = parser.close()
     except OSError as error:
@@ -294,9 +294,14 @@ def _axes(where: str, group: ElementTree.Element) -> np.ndarray:
     """(3, 3) axes of the cameras of a group, a row each, in a frame with x right, y down, z forward."""
     text = _text(group, "CameraOrientation") or "XRightYDown"
     x, _, y = text.removeprefix("X").partition("Y")
-    if not text.startswith("X") or x not in SIDES or y not in SIDES or np.dot(SIDES[x], SIDES[y]):
+    if (
+        not text.startswith("X")
+        or x not in SIDE_DIRECTIONS
+        or y not in SIDE_DIRECTIONS
+        or np.dot(SIDE_DIRECTIONS[x], SIDE_DIRECTIONS[y])
+    ):
         raise BadInput(f"{where}: CameraOrientation {text!r} is none such as XRightYDown or XRightYUp; export again")
-    right, down = (*SIDES[x], 0.0), (*SIDES[y], 0.0)
+    right, down = (*SIDE_DIRECTIONS[x], 0.0), (*SIDE_DIRECTIONS[y], 0.0)
     return np.array([right, down, np.cross(right, down)])
 
 

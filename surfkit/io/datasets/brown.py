@@ -10,14 +10,14 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.camera_files import MOST
+from surfkit.io.datasets.camera_files import MAX_CAMERA_NUMBER
 from surfkit.io.datasets.capture import camera_of
 
-SAMPLES = 41
+GRID_SAMPLES_PER_SIDE = 41
 """Points along each side of the grid on which a camera is compared with the lens."""
-QUIET_PX, MOST_PX = 0.1, 0.5
+QUIET_DIFFERENCE_PX, MAX_DIFFERENCE_PX = 0.1, 0.5
 """Differences between both that are not told of, and the largest that is accepted, pixels."""
-WIDEST = 10.0
+MAX_RAY_TANGENT = 10.0
 """Rays farther than this from the axis, as x / z, are not looked at."""
 
 
@@ -75,7 +75,7 @@ class Brown:
             BadInput: There is no such lens, or none of COLMAP's is like it.
         """
         values = [*self.focal, *self.centre, *self.radial, *self.tangential, *self.higher, self.shear]
-        if not (all(abs(value) < MOST for value in values) and min(*self.size, *self.focal) > 0):
+        if not (all(abs(value) < MAX_CAMERA_NUMBER for value in values) and min(*self.size, *self.focal) > 0):
             shown = ", ".join(f"{value:g}" for value in values)
             raise BadInput(f"{where}: no lens has size {self.size[0]} x {self.size[1]} and parameters {shown}")
         (k1, k2, k3, k4), (p1, p2), reach = self.radial, self.tangential, self._reach()
@@ -90,7 +90,7 @@ class Brown:
             model, extra = "PINHOLE", []
         made = camera_of(where, model, self.size, [*self.focal, *self.centre, *extra])
         off = self._off(made, reach) if self.lost else 0.0
-        if not off <= MOST_PX:
+        if not off <= MAX_DIFFERENCE_PX:
             raise BadInput(
                 f"{where}: no camera model of COLMAP has its {self.lost}: without, pixels are up to {off:.2g} off; "
                 "optimise the cameras without it, or use undistorted photographs"
@@ -110,10 +110,10 @@ class Brown:
     def _reach(self) -> float:
         """How far from the axis, as r, the picture shows something, or the lens folds back."""
         away = np.maximum(np.abs(self.centre), np.abs(np.array(self.size) - self.centre)) / self.focal
-        r = np.linspace(0, WIDEST, 4001)
+        r = np.linspace(0, MAX_RAY_TANGENT, 4001)
         bent = (np.arctan(r) if self.fisheye else r) * self._swell((np.arctan(r) if self.fisheye else r) ** 2)
         ends = np.flatnonzero((bent[1:] > np.linalg.norm(away)) | (np.diff(bent) <= 0))
-        return float(r[ends[0] + 1] if len(ends) else WIDEST)
+        return float(r[ends[0] + 1] if len(ends) else MAX_RAY_TANGENT)
 
     def _rational(self, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients of (1 + a1 s + a2 s^2 + a3 s^3) / (1 + b1 s + b2 s^2 + b3 s^3), which is nearest to the radial
@@ -128,7 +128,7 @@ class Brown:
 
     def _off(self, made: Any, reach: float) -> float:
         """The largest distance between a pixel of a camera and that of the lens."""
-        side = np.linspace(-reach, reach, SAMPLES)
+        side = np.linspace(-reach, reach, GRID_SAMPLES_PER_SIDE)
         xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
         true = self.pixels(xy)
         shown = (np.linalg.norm(xy, axis=1) <= reach) & ((true >= 0) & (true <= self.size)).all(1)
@@ -136,7 +136,7 @@ class Brown:
         return float(np.linalg.norm(got - true[shown], axis=1).max(initial=0))
 
 
-class Lenses:
+class LensTable:
     """The cameras of the lenses of a data set: one for all equal ones, and one line for all that they lose."""
 
     def __init__(self, path: Path):
@@ -152,7 +152,7 @@ class Lenses:
 
     def tell(self) -> None:
         """Say what the cameras lose, where that moves pixels."""
-        moved = {lens: off for lens, (_, off) in self._made.items() if off > QUIET_PX}
+        moved = {lens: off for lens, (_, off) in self._made.items() if off > QUIET_DIFFERENCE_PX}
         if moved:
             worst = max(moved, key=lambda lens: moved[lens])
             count = f"{len(moved)} of {len(self._made)} lenses"

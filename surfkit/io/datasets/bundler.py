@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.camera_files import (
-    MOST,
+    MAX_CAMERA_NUMBER,
     groups_of,
     leave_out,
     one_file,
@@ -26,21 +26,21 @@ from surfkit.io.datasets.camera_files import (
     read_text,
     tracks_of,
 )
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, camera_of
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.scene.photos import photo_size
 
-PLACES = ("bundle.out", "bundle/bundle.out")
+BUNDLE_FILES = ("bundle.out", "bundle/bundle.out")
 """Where Bundler writes its file; other programs call it NAME.bundle.out."""
-HEAD, MOST_HEAD = "# Bundle file v0.3", 1000
+HEADER_PREFIX, MAX_HEADER_BYTES = "# Bundle file v0.3", 1000
 """How the file begins, and bytes of its first line at most."""
-SLACK_PX = 2.0
+MARK_SLACK_PX = 2.0
 """How far beyond the edge of a photograph a mark may lie, as programs differ by half a pixel."""
-FEWEST_MARKS, STRAY = 3, 0.02
+MIN_STRAY_MARKS, MIN_STRAY_SHARE = 3, 0.02
 """So many marks, and so large a share of them, lie outside of a photograph by no mistake."""
-INNER, MANY_MARKS = 0.7, 500
+MAX_INNER_SHARE, MIN_INNER_MARKS = 0.7, 500
 """Share of the way from the middle to the edge that some of so many marks lie beyond."""
-FLIP = np.diag([1.0, -1.0, -1.0])
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """From Bundler's cameras (x right, y up, z backward) to x right, y down, z forward."""
 
 
@@ -51,11 +51,11 @@ class Bundler(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         bundle = _Bundle.read(data)
         shots, seen = bundle.shots(data), bundle.seen()
         _check_sizes(bundle.path, shots, seen)
-        return Capture(shots, bundle.xyz, bundle.rgb, groups=groups_of(shots, seen))
+        return RawDataset(shots, bundle.xyz, bundle.rgb, groups=groups_of(shots, seen))
 
     def tracks(self, data: Data) -> Tracks:
         bundle = _Bundle.read(data)
@@ -101,7 +101,7 @@ class _Bundle:
             raise BadInput(f"{path}: cut off: numbers of {(len(values) - 2) // 15} of {cameras} cameras are there")
         names = _names(path, cameras)
         table, starts, counts = _points(path, values, begin, points)
-        good = (np.abs(table) < MOST).all(1)
+        good = (np.abs(table) < MAX_CAMERA_NUMBER).all(1)
         kept = np.cumsum(good) - 1
         rows = np.repeat(np.where(good, kept, -1), counts)
         inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -112,7 +112,7 @@ class _Bundle:
         shaped = values[2:begin].reshape(-1, 5, 3)
         return cls(path, names, shaped, table[good, :3], rgb, sights[use], rows[use])
 
-    def shots(self, data: Data) -> list[Shot]:
+    def shots(self, data: Data) -> list[RawImage]:
         """The photographs with a camera."""
         has = self.cameras[:, 0, 0] != 0
         placed = [name for name, there in zip(self.names, has, strict=True) if there]
@@ -125,13 +125,13 @@ class _Bundle:
                     shots.append(self._shot(name, camera, found[name]))
         return shots
 
-    def _shot(self, name: str, camera: np.ndarray, photo: Path) -> Shot:
+    def _shot(self, name: str, camera: np.ndarray, photo: Path) -> RawImage:
         where, (focal, k1, k2), turn = f"{self.path}: camera of {name!r}", camera[0], camera[1:4]
         if not np.isfinite(camera).all() or not focal > 0:
             raise BadInput(f"{where}: focal length {focal:g}, or numbers that are not finite")
         width, height = photo_size(photo)
-        pose = pose_at(where, FLIP @ turn, -turn.T @ camera[4])
-        return Shot(
+        pose = pose_at(where, OPENGL_TO_OPENCV @ turn, -turn.T @ camera[4])
+        return RawImage(
             name, pose, camera_of(where, "RADIAL", (width, height), [focal, width / 2, height / 2, k1, k2]), photo
         )
 
@@ -143,15 +143,15 @@ class _Bundle:
         return {name: (self.rows[part], self.sights[part, 2:]) for name, part in zip(self.names, parts, strict=True)}
 
 
-def _check_sizes(path: Path, shots: Sequence[Shot], seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+def _check_sizes(path: Path, shots: Sequence[RawImage], seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
     """BadInput for photographs that are smaller than when their cameras were found, of which the file has no sizes: the
     marks of points lie outside then. A line where all marks lie far inside, as if photographs had been enlarged."""
     outside, reach, most = [], 0.0, 0.0
     for shot in shots:
         half = np.array([shot.camera.width, shot.camera.height]) / 2
         offsets = np.abs(seen[shot.name][1])
-        beyond = (offsets > half + SLACK_PX).any(1)
-        if beyond.sum() >= FEWEST_MARKS and beyond.mean() > STRAY:
+        beyond = (offsets > half + MARK_SLACK_PX).any(1)
+        if beyond.sum() >= MIN_STRAY_MARKS and beyond.mean() > MIN_STRAY_SHARE:
             outside.append(shot.name)
             most = max(most, float((offsets / half).max()))
         reach = max(reach, float((offsets / half).max(initial=0)))
@@ -163,7 +163,7 @@ def _check_sizes(path: Path, shots: Sequence[Shot], seen: Mapping[str, tuple[np.
                 "that the cameras were found for, or turned; use those"
             )
         )
-    elif 0 < reach < INNER and sum(len(seen[shot.name][1]) for shot in shots) >= MANY_MARKS:
+    elif 0 < reach < MAX_INNER_SHARE and sum(len(seen[shot.name][1]) for shot in shots) >= MIN_INNER_MARKS:
         emit(
             Warned(
                 f"{path}: all marks of points lie in the inner {reach:.0%} of the photographs: if these are larger "
@@ -174,7 +174,7 @@ def _check_sizes(path: Path, shots: Sequence[Shot], seen: Mapping[str, tuple[np.
 
 def _files(root: Path) -> list[Path]:
     """The bundle files of a folder; those in the usual places first."""
-    usual = [root / place for place in PLACES if (root / place).is_file()]
+    usual = [root / place for place in BUNDLE_FILES if (root / place).is_file()]
     return usual[:1] or sorted(path for path in root.glob("*.bundle.out") if path.is_file())
 
 
@@ -183,14 +183,16 @@ def _values(path: Path) -> np.ndarray:
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("error")
-            head = file.readline(MOST_HEAD).decode("utf-8-sig", "replace")
-            values = np.fromfile(file, np.float64, sep=" ") if head.startswith(HEAD) else np.empty(0)
+            head = file.readline(MAX_HEADER_BYTES).decode("utf-8-sig", "replace")
+            values = np.fromfile(file, np.float64, sep=" ") if head.startswith(HEADER_PREFIX) else np.empty(0)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, DeprecationWarning) as error:
         raise BadInput(f"{path}: something that is no number lies among the numbers; copy the file whole") from error
-    if not head.startswith(HEAD):
-        raise BadInput(f"{path}: begins with {head.strip()[:40]!r}, not with {HEAD!r}, the version that is read")
+    if not head.startswith(HEADER_PREFIX):
+        raise BadInput(
+            f"{path}: begins with {head.strip()[:40]!r}, not with {HEADER_PREFIX!r}, the version that is read"
+        )
     if len(values) < 2:
         raise BadInput(f"{path}: cut off after the first line; copy it whole")
     return values

@@ -12,15 +12,15 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import Shot, Tracks, shorten
+from surfkit.io.datasets.capture import RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.undistort import is_panorama
 from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
-MOST = 1e30
+MAX_CAMERA_NUMBER = 1e30
 """Numbers beyond it are a mistake."""
-TURNED = 1e-3
+MAX_ROTATION_ERROR = 1e-3
 """Most that the entries of a rotation times its transpose are off those of the identity."""
 
 
@@ -50,7 +50,7 @@ def numbers(where: str, text: str | Sequence[str], count: int) -> np.ndarray:
         values = np.array([float(word) for word in words], np.float64)
     except (ValueError, TypeError) as error:
         raise BadInput(f"{where}: {shorten(text)}, where {wanted}") from error
-    if len(values) != count or not (np.abs(values) < MOST).all():
+    if len(values) != count or not (np.abs(values) < MAX_CAMERA_NUMBER).all():
         raise BadInput(f"{where}: {shorten(text)}, where {wanted}")
     return values
 
@@ -85,7 +85,7 @@ def pose_at(where: str, turn: np.ndarray, centre: np.ndarray) -> np.ndarray:
         BadInput: It is no rotation; names `where` it comes from.
     """
     off = np.abs(turn @ turn.T - np.eye(3)).max() if (np.abs(turn) < 2).all() else np.inf
-    if not (off < TURNED and np.linalg.det(turn) > 0 and (np.abs(centre) < MOST).all()):
+    if not (off < MAX_ROTATION_ERROR and np.linalg.det(turn) > 0 and (np.abs(centre) < MAX_CAMERA_NUMBER).all()):
         raise BadInput(
             f"{where}: the pose is not a rotation and a place; write the file again, or leave the camera out"
         )
@@ -128,7 +128,7 @@ def leave_out(path: Path, names: Sequence[str], count: int, why: str) -> None:
     emit(Warned(f"{path}: {len(names)} of {count} photographs are left out, which {why}: {few(names)}"))
 
 
-def tracks_of(shots: Sequence[Shot], xyz: np.ndarray, seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Tracks:
+def tracks_of(shots: Sequence[RawImage], xyz: np.ndarray, seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Tracks:
     """The observations of sparse points, with the mean error of each point in pixels.
 
     Args:
@@ -154,7 +154,7 @@ def tracks_of(shots: Sequence[Shot], xyz: np.ndarray, seen: Mapping[str, tuple[n
     return Tracks(xyz, mean, {name: seen[name] for name in cameras}, cameras)
 
 
-def groups_of(shots: Sequence[Shot], seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[list[str]]:
+def groups_of(shots: Sequence[RawImage], seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[list[str]]:
     """Names of the photographs that sparse points connect, as `Capture` has them."""
     names = [shot.name for shot in shots if len(seen.get(shot.name, ((),))[0])]
     if not names:

@@ -15,7 +15,7 @@ from surfkit.core.check import BadInput
 
 
 @dataclass(frozen=True)
-class Shot:
+class RawImage:
     """A photograph as the data set has it.
 
     Attributes:
@@ -34,7 +34,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Capture:
+class RawDataset:
     """A data set as it is.
 
     Attributes:
@@ -50,7 +50,7 @@ class Capture:
         numbered: Whether the order of the photographs is that of the numbers which COLMAP has given them.
     """
 
-    shots: Sequence[Shot]
+    shots: Sequence[RawImage]
     xyz: np.ndarray
     rgb: np.ndarray
     held_out: frozenset[str] | None = None

@@ -13,19 +13,19 @@ import numpy as np
 from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, load_pycolmap
-from surfkit.io.datasets.colmap_files import PARTS, cut_off, refuse_cut_off
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, load_pycolmap
+from surfkit.io.datasets.colmap_files import MIN_ENTRY_BYTES, cut_off, refuse_cut_off
 from surfkit.io.datasets.data import Data, nearest
-from surfkit.io.datasets.placed import Placed, on_the_map, read_placed
+from surfkit.io.datasets.placed import Georeference, on_the_map, read_placed
 from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a model may lie, the first that is there wins."""
 
-BASES = ("sparse", "colmap/sparse")
+MODEL_PARENT_FOLDERS = ("sparse", "colmap/sparse")
 """Where COLMAP numbers the models of photographs that it could not connect."""
-ENDS = (".bin", ".txt")
+MODEL_SUFFIXES = (".bin", ".txt")
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,11 @@ class COLMAP(Reader):
     priority: ClassVar[int] = 1  # other layouts have no observations of the sparse points, which aligned priors need
 
     def recognises(self, root: Path) -> bool:
-        return any(len(_lacking(place, end)) < len(PARTS) for place in _places(root) for end in ENDS)
+        return any(
+            len(_lacking(place, end)) < len(MIN_ENTRY_BYTES) for place in _places(root) for end in MODEL_SUFFIXES
+        )
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         folder = self.model_folder(data)
         if data.model is None and len(models := _beside(folder)) > 1:
             counts = ", ".join(f"{place.relative_to(data.path)} of {_images(place)}" for place in models)
@@ -50,8 +52,8 @@ class COLMAP(Reader):
         images, xyz, rgb, groups = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
         pairs = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
-        shots = [Shot(image.name, image.pose, image.camera, path) for image, path in pairs]
-        capture = Capture(shots, xyz, rgb, groups=groups, numbered=True)
+        shots = [RawImage(image.name, image.pose, image.camera, path) for image, path in pairs]
+        capture = RawDataset(shots, xyz, rgb, groups=groups, numbered=True)
         placed = _placed(data.path, folder)
         return capture if placed is None else on_the_map(capture, placed)
 
@@ -76,7 +78,7 @@ class COLMAP(Reader):
 
 
 @dataclass(frozen=True)
-class Image:
+class ColmapImage:
     """An image of the model: its name, (4, 4) world_to_camera in the input frame, and COLMAP's camera."""
 
     name: str
@@ -84,7 +86,7 @@ class Image:
     camera: Any
 
 
-def _placed(root: Path, folder: Path) -> Placed | None:
+def _placed(root: Path, folder: Path) -> Georeference | None:
     """Where a model lies, by a file beside it or in a folder above it, up to that of the data set."""
     above = folder.relative_to(root).parts if folder.is_relative_to(root) else ()
     return read_placed(folder, *(root.joinpath(*above[:depth]) for depth in range(len(above))), root)
@@ -92,8 +94,8 @@ def _placed(root: Path, folder: Path) -> Placed | None:
 
 def _places(root: Path) -> list[Path]:
     """Where a model may lie: the usual places, and any numbered folders beside them."""
-    numbered = [path for base in BASES for path in sorted((root / base).glob("[0-9]*")) if path.is_dir()]
-    return list(dict.fromkeys([*(root / place for place in MODELS), *numbered]))
+    numbered = [path for base in MODEL_PARENT_FOLDERS for path in sorted((root / base).glob("[0-9]*")) if path.is_dir()]
+    return list(dict.fromkeys([*(root / place for place in MODEL_FOLDERS), *numbered]))
 
 
 def _largest(root: Path) -> Path:
@@ -103,7 +105,7 @@ def _largest(root: Path) -> Path:
         return max(_beside(whole), key=_images)
     for place in _places(root):
         _refuse_torn(place)
-    raise BadInput(f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}")
+    raise BadInput(f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
 
 
 def _named(place: Path) -> Path:
@@ -122,13 +124,13 @@ def _beside(place: Path) -> list[Path]:
 
 
 def _is_whole(place: Path) -> bool:
-    return any(not _lacking(place, end) for end in ENDS)
+    return any(not _lacking(place, end) for end in MODEL_SUFFIXES)
 
 
 def _refuse_torn(place: Path) -> None:
     """BadInput if a folder has some of the files of a model."""
-    lacking = min((_lacking(place, end) for end in ENDS), key=len)
-    if len(lacking) < len(PARTS):
+    lacking = min((_lacking(place, end) for end in MODEL_SUFFIXES), key=len)
+    if len(lacking) < len(MIN_ENTRY_BYTES):
         raise BadInput(f"{place}: the COLMAP model lacks {', '.join(lacking)}; copy it whole")
 
 
@@ -143,10 +145,10 @@ def _images(folder: Path) -> int:
 
 
 def _lacking(folder: Path, end: str) -> list[str]:
-    return [f"{part}{end}" for part in PARTS if not (folder / f"{part}{end}").is_file()]
+    return [f"{part}{end}" for part in MIN_ENTRY_BYTES if not (folder / f"{part}{end}").is_file()]
 
 
-def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray, list[list[str]]]:
+def _model(folder: Path) -> tuple[list[ColmapImage], np.ndarray, np.ndarray, list[list[str]]]:
     """Images in the order of their numbers, (P, 3) float64 points in the input frame, (P, 3) uint8 colours, groups."""
     model = _reconstruction(folder)
     shots = _shots(folder, model)
@@ -167,7 +169,7 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray, list[list
 
 
 def _groups(model: Any, points: Sequence[Any]) -> list[list[str]]:
-    """Names of the images that points connect, as `Capture` has them."""
+    """Names of the images that points connect, as `RawDataset` has them."""
     observed = [(number, image.name) for number, image in sorted(model.images.items()) if image.num_points3D]
     place = {number: at for at, (number, _) in enumerate(observed)}
     shuffled = (points[at] for at in np.random.default_rng(0).permutation(len(points)))  # their order is that of images
@@ -224,7 +226,7 @@ def _name_whole(path: Path, model: Any) -> None:
                     model.image(number).name = name
 
 
-def _shots(folder: Path, model: Any) -> list[Image]:
+def _shots(folder: Path, model: Any) -> list[ColmapImage]:
     shots = []
     for _, image in sorted(model.images.items()):
         if not getattr(image, "has_pose", True):
@@ -235,7 +237,7 @@ def _shots(folder: Path, model: Any) -> list[Image]:
         if not np.isfinite(full).all():
             reject(BadInput(f"{folder}: the pose of {image.name!r} is not finite; delete the image from the model"))
             continue
-        shots.append(Image(image.name, full, model.cameras[image.camera_id]))
+        shots.append(ColmapImage(image.name, full, model.cameras[image.camera_id]))
     if not shots:
         raise BadInput(f"{folder}: the model has no image with a pose; run COLMAP's mapper on the photographs")
     return shots

@@ -12,28 +12,28 @@ from pathlib import Path
 
 from surfkit.core.check import BadInput
 
-PARTS = {"cameras": 40, "images": 73, "points3D": 51}
+MIN_ENTRY_BYTES = {"cameras": 40, "images": 73, "points3D": 51}
 """The files of a model, and the fewest bytes that an entry of the binary one takes."""
-OPTIONAL = {"rigs": 8, "frames": 68}
+MIN_RIG_ENTRY_BYTES = {"rigs": 8, "frames": 68}
 """Further files of models with rigs."""
-POSE = 56
+POSE_BYTES = 56
 """Bytes of a rotation and a translation."""
 
 
 def refuse_cut_off(folder: Path) -> None:
     """BadInput where binary files of a model end before their entries do."""
     cut = []
-    for part, least in (PARTS | OPTIONAL).items():
+    for part, least in (MIN_ENTRY_BYTES | MIN_RIG_ENTRY_BYTES).items():
         path = folder / f"{part}.bin"
-        if part in OPTIONAL and not path.is_file():
+        if part in MIN_RIG_ENTRY_BYTES and not path.is_file():
             continue
         size = path.stat().st_size
         with path.open("rb") as file:
             count = struct.unpack("<Q", file.read(8))[0] if size >= 8 else 1
             whole = size >= 8 + count * least
-            if whole and count and part in ENTRIES:
+            if whole and count and part in ENTRY_READERS:
                 with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
-                    whole = _whole(raw, count, ENTRIES[part])
+                    whole = _whole(raw, count, ENTRY_READERS[part])
         if not whole:
             cut.append(path)
     if cut:
@@ -77,7 +77,7 @@ def _rig(raw: mmap.mmap, at: int) -> int:
         return len(raw) + 1
     at += 8 + 8 * (count > 0)
     for _ in range(count - 1):
-        at += 9 + (POSE if raw[at + 8 : at + 9] != b"\0" else 0)
+        at += 9 + (POSE_BYTES if raw[at + 8 : at + 9] != b"\0" else 0)
     return at
 
 
@@ -87,5 +87,5 @@ def _frame(raw: mmap.mmap, at: int) -> int:
 
 
 _LONG, _SHORT = struct.Struct("<Q").unpack_from, struct.Struct("<I").unpack_from
-ENTRIES = {"images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}
+ENTRY_READERS = {"images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}
 """Of the files whose entries differ in length; those of cameras are known when they are read."""

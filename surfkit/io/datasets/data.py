@@ -13,19 +13,19 @@ import tyro
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, name_of
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.depth_layout import DepthLayout
 from surfkit.io.datasets.split import Split
 from surfkit.scene.pixels import Alpha
 
-LONGEST = 1600
+DEFAULT_LONGEST_PX = 1600
 """Default for the longest side of a photograph, pixels."""
 TEST_EVERY = 8
 """Default for which photographs are held out: every so many-th; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class ReadSettings:
     """How a data set is read: at which size, from which of its files, and which photographs are held out."""
 
     scale: float | None = None
@@ -117,18 +117,18 @@ class Reading:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height to use, for a photograph of `width` x `height` pixels; never larger than it is."""
-        longest = self.longest or (LONGEST if self.scale is None else max(width, height))
+        longest = self.longest or (DEFAULT_LONGEST_PX if self.scale is None else max(width, height))
         by = max(self.scale or 1.0, max(width, height) / longest)
         return max(1, round(width / by)), max(1, round(height / by))
 
     def of(self, path: Path, test_every: int = TEST_EVERY) -> Data:
         """The data set at `path`, read so; every so many-th photograph is held out if nobody has said which."""
-        given = {each.name: getattr(self, each.name) for each in fields(Reading)}
+        given = {each.name: getattr(self, each.name) for each in fields(ReadSettings)}
         return Data(path, **{"test_every": test_every} | {name: it for name, it in given.items() if it is not None})
 
 
 @dataclass(frozen=True)
-class Data(Reading):
+class Data(ReadSettings):
     """A data set and how it is read."""
 
     path: Annotated[Path, tyro.conf.arg(name="data")]
@@ -141,7 +141,7 @@ class Data(Reading):
     priors: Annotated[Path | None, tyro.conf.Suppress] = None
     """Folder of the depth maps that a run made for it, where it has none of its own."""
 
-    def held_out(self, capture: Capture) -> set[str]:
+    def held_out(self, capture: RawDataset) -> set[str]:
         """Names of the photographs that are held out: not trained on, kept to measure with.
 
         Raises:
@@ -161,7 +161,7 @@ class Data(Reading):
             raise BadInput(f"{rule} holds out all {len(names)} photographs; use --test-every 0 to hold out none")
         return chosen
 
-    def _by_rule(self, split: Split, capture: Capture) -> tuple[set[str], str]:
+    def _by_rule(self, split: Split, capture: RawDataset) -> tuple[set[str], str]:
         """What a split holds out, and how the user chose it."""
         rule = f"--split {name_of(split)}"
         try:

@@ -9,17 +9,17 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import Shot
+from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.scene.photos import read_photo
 
-SHOTS = 200
+MAX_CLOUD_SHOTS = 200
 """Photographs that are looked at, spread evenly; all of them would take minutes each time a data set is read."""
-POINTS = 200_000
+MAX_DEPTH_POINTS = 200_000
 """All together; no pixel is taken twice."""
 
 
-def sample_depth_maps(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> tuple[np.ndarray, np.ndarray]:
+def sample_depth_maps(shots: Sequence[RawImage], maps: Mapping[str, DepthFile]) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) float64 positions in the input frame and (P, 3) uint8 colours of random pixels, the same ones each time.
 
     Maps that cannot be read are passed over, with a note.
@@ -29,14 +29,14 @@ def sample_depth_maps(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> t
         maps: Exact depth by name of the photograph, input units.
     """
     having = [shot for shot in shots if shot.name in maps]
-    chosen = having[:: max(1, -(-len(having) // SHOTS))]
+    chosen = having[:: max(1, -(-len(having) // MAX_CLOUD_SHOTS))]
     if not chosen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
     def seen(at: int) -> tuple[np.ndarray, np.ndarray] | str:
         file = maps[chosen[at].name]
         try:
-            return _points(chosen[at], file.read(), POINTS // len(chosen), at)
+            return _points(chosen[at], file.read(), MAX_DEPTH_POINTS // len(chosen), at)
         except BadInput as error:
             return f"{file.path}: {error}"
 
@@ -52,7 +52,7 @@ def sample_depth_maps(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> t
     return xyz, rgb
 
 
-def _points(shot: Shot, inverse: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _points(shot: RawImage, inverse: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """At most so many points of one photograph, whose inverse depth is (h, w)."""
     height, width = inverse.shape
     known = np.flatnonzero(inverse.reshape(-1) > 0)

@@ -21,11 +21,11 @@ from surfkit.scene.photos import open_picture
 EXR = ".exr"
 NO_DEPTH = 65504.0
 """The largest half float: the sky in MatrixCity's depth maps."""
-FOLDER = "estimated_depths"
-RECORD = "depth.json"
-APART = ("path", "straight")
+DEPTH_FOLDER = "estimated_depths"
+DEPTH_RECORD = "depth.json"
+PATH_FIELDS = ("path", "straight")
 """Fields of a depth file that say nothing of its numbers."""
-UNIT = 127
+NORMAL_SCALE = 127
 """What a component of 1 of a normal is stored as."""
 warnings.filterwarnings("ignore", r"Reading `\.npy`", UserWarning)  # of Python 2, whose arrays are as good
 
@@ -65,7 +65,7 @@ class DepthFile:
     @property
     def meaning(self) -> tuple[Any, ...]:
         """Everything but the file that decides what `read` gives."""
-        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in APART)
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in PATH_FIELDS)
 
     def read(self) -> np.ndarray:
         """(h, w) float32 inverse depth, up to an affine map unless `aligned`; NaN where there is none.
@@ -112,7 +112,7 @@ class DepthFile:
 
 def map_path(root: Path, name: str) -> Path:
     """Where surfkit and CityGaussianV2 keep the inverse depth of a photograph, whose name may lead anywhere."""
-    path = root / FOLDER / safe_path(name)
+    path = root / DEPTH_FOLDER / safe_path(name)
     return path.with_name(f"{path.name}.npy")
 
 
@@ -143,7 +143,7 @@ def write_map(
     if normal is None:
         normal_path(path).unlink(missing_ok=True)
     else:
-        save_array(normal_path(path), (normal.clip(-1, 1) * UNIT).round().astype(np.int8))
+        save_array(normal_path(path), (normal.clip(-1, 1) * NORMAL_SCALE).round().astype(np.int8))
     save_array(path, inverse.astype(np.float32))
 
 
@@ -167,7 +167,7 @@ def is_whole(path: Path, oriented: bool) -> bool:
 
 def read_record(root: Path) -> Mapping[str, Any]:
     """What made the maps of a data set, from estimated_depths/depth.json; empty where other programs made them."""
-    path = root / FOLDER / RECORD
+    path = root / DEPTH_FOLDER / DEPTH_RECORD
     if not path.exists():
         return {}
     try:
@@ -178,7 +178,7 @@ def read_record(root: Path) -> Mapping[str, Any]:
 
 def write_record(root: Path, record: Mapping[str, Any]) -> None:
     """Say what made the maps."""
-    write_json(root / FOLDER / RECORD, record)
+    write_json(root / DEPTH_FOLDER / DEPTH_RECORD, record)
 
 
 def save_array(path: Path, values: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
-from surfkit.io.datasets.depth_files import EXR, FOLDER, DepthFile, map_path, read_record
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER, EXR, DepthFile, map_path, read_record
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
 from surfkit.scene.names import name_below, named_file, safe_path
 
@@ -19,7 +19,7 @@ NERFSTUDIO_UNIT, NGP_UNIT = "depth_unit_scale_factor", "integer_depth_scale"
 """What stored depths are multiplied by, in the units of the poses."""
 TRANSFORMS = ("transforms.json", *(f"transforms_{part}.json" for part in ("train", "val", "test")))
 CENTIMETRE = 0.01
-PHOTOS = ("rgb", "images", "input")
+PHOTO_FOLDERS = ("rgb", "images", "input")
 """Folders of photographs inside a block of MatrixCity, which has none or one of them."""
 
 
@@ -34,7 +34,7 @@ class EstimatedDepths(DepthLayout):
 
     def find(self, query: DepthQuery) -> Mapping[str, DepthFile] | None:
         """See `DepthLayout.find`."""
-        if not (query.root / FOLDER).is_dir():
+        if not (query.root / DEPTH_FOLDER).is_dir():
             return None
         record = read_record(query.root)
         aligned, own = record.get("aligned") is True, "estimator" in record
@@ -146,7 +146,7 @@ def _number(path: Path, at: str, value: Any) -> float:
 def _city_places(root: Path, photo: PurePosixPath) -> Iterator[Path]:
     """Where MatrixCity may have the depth of a photograph."""
     block = photo.parent
-    if block.name in PHOTOS or block.name == block.parent.name:
+    if block.name in PHOTO_FOLDERS or block.name == block.parent.name:
         block = block.parent
     stem = f"{photo.stem}{EXR}"
     depth = f"{block.name}_depth"

@@ -18,13 +18,13 @@ from surfkit.scene.align import align, sample
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Lens, Scene, View
 
-LOOKED_AT = 32
+COMPARED_MAPS = 32
 """Maps that are compared with sparse points, spread evenly: all of them are of one kind."""
-MOVED_PX = 1.0
+MIN_SHIFT_PX = 1.0
 """Points that the lens moves by less, in pixels of the map, tell nothing."""
-SURE = 0.6
+MIN_FIT_SHARE = 0.6
 """Share of the points that must fit better, at least."""
-SIGMAS = 3.0
+MIN_MAJORITY_SIGMAS = 3.0
 """By how many standard deviations of a coin thrown for each point they must be more than half, at least."""
 
 
@@ -91,13 +91,13 @@ def judge(data: Data, scene: Scene, maps: Mapping[str, DepthFile], tracks: Obser
     if data.depth_of is not None:
         return Verdict(data.depth_of == "undistorted", "user")
     views = [v for v in scene.train if v.lens is not None and v.name in maps and not maps[v.name].straight]
-    chosen = views[:: max(1, -(-len(views) // LOOKED_AT))]
+    chosen = views[:: max(1, -(-len(views) // COMPARED_MAPS))]
     with ThreadPoolExecutor(4) as pool:
         votes = list(pool.map(lambda view: _votes(view, maps[view.name], tracks, scene), chosen))
     undistorted, of_distorted = np.sum(votes, axis=0, dtype=np.int64) if votes else (0, 0)
     count = undistorted + of_distorted
     most = max(undistorted, of_distorted)
-    if most < SURE * count or abs(undistorted - of_distorted) <= SIGMAS * np.sqrt(count):
+    if most < MIN_FIT_SHARE * count or abs(undistorted - of_distorted) <= MIN_MAJORITY_SIGMAS * np.sqrt(count):
         return Verdict()
     return Verdict(bool(undistorted > of_distorted), "points")
 
@@ -111,7 +111,7 @@ def _votes(view: View, file: DepthFile, tracks: Observations, scene: Scene) -> t
             return 0, 0
         at, inverse, _ = points_in(view, tracks, scene, guess=file.aligned)
         bent = distorted(at, view.lens)
-        moved = np.linalg.norm((bent - at) * values.shape[::-1], axis=1) > MOVED_PX
+        moved = np.linalg.norm((bent - at) * values.shape[::-1], axis=1) > MIN_SHIFT_PX
         off = [_off(sample(values, spots), inverse)[moved] for spots in (at, bent)]
     except BadInput:  # told when it is used
         return 0, 0

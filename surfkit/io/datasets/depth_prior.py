@@ -30,15 +30,15 @@ from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Lens, Scene, View
 from surfkit.scene.vectors import unit
 
-TRUSTED = 0.5
+MIN_TRUSTED_CONFIDENCE = 0.5
 """Pixels of a higher confidence count as trusted."""
-HARDLY = 0.02
+MIN_TRUSTED_SHARE = 0.02
 """Below this share of trusted pixels, something is wrong with the input of the maps."""
-NAMED = 10
+LISTED_PHOTOS = 10
 """Photographs that a warning names."""
-OFF = "everything that learns from them is switched off, such as the losses depth and normal-prior"
+SWITCHED_OFF = "everything that learns from them is switched off, such as the losses depth and normal-prior"
 """Consequence of missing depth priors."""
-KNOWN = 0.1
+MIN_KNOWN_CONFIDENCE = 0.1
 """Least confidence of a pixel of which a depth prior knows something."""
 
 
@@ -64,7 +64,7 @@ Priors = Cache["DepthPrior | None"]
 
 
 @dataclass(frozen=True)
-class Alignment:
+class DepthAlignment:
     """How the depth maps of a data set become inverse depths, whichever of its photographs are trained on.
 
     Attributes:
@@ -79,12 +79,12 @@ class Alignment:
 
 
 @dataclass(frozen=True)
-class Fit:
+class ScaleOffsetFit:
     """A map, and the scale and offset that turn its values into inverse depths in 1/local units.
 
     `trusted` is the share of its pixels with high confidence, 1 where that is not known; `unit` is what tells its unit,
-    if it has one. `straight` is as for `Alignment`, `lens` what distorts it, if anything does, and `either` whether its
-    shape does not tell.
+    if it has one. `straight` is as for `DepthAlignment`, `lens` what distorts it, if anything does, and `either`
+    whether its shape does not tell.
     """
 
     file: DepthFile
@@ -99,7 +99,7 @@ class Fit:
 
 def prior_cache(
     views: Sequence[View],
-    fits: Sequence[Fit | None],
+    fits: Sequence[ScaleOffsetFit | None],
     typical: float,
     budget_bytes: int | None = None,
     normals: bool = False,
@@ -127,7 +127,7 @@ def _unpacked(prior: DepthPrior | None) -> DepthPrior | None:
     return replace(prior, normal=unit(prior.normal.to(torch.float32)))
 
 
-def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
+def _read(view: View, fit: ScaleOffsetFit, typical: float, normals: bool) -> DepthPrior:
     size = (view.camera.height, view.camera.width)
     try:
         inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
@@ -163,7 +163,7 @@ def read_priors(
     data: Data,
     scene: Scene,
     budget_bytes: int | None = None,
-    known: Alignment | None = None,
+    known: DepthAlignment | None = None,
     normals: bool = False,
 ) -> Priors | None:
     """The depth priors of a data set; None where there are none.
@@ -184,13 +184,15 @@ def read_priors(
         again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it again"
         raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
     fits = [
-        Fit(maps[v.name], *known.fits[v.name], straight=known.straight) if v.name in known.fits else None
+        ScaleOffsetFit(maps[v.name], *known.fits[v.name], straight=known.straight) if v.name in known.fits else None
         for v in scene.train
     ]
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
 
-def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float, float] = SCALE_BAND) -> Alignment:
+def alignment(
+    data: Data, scene: Scene, normals: bool = False, band: tuple[float, float] = SCALE_BAND
+) -> DepthAlignment:
     """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning; where `normals` are wanted
@@ -203,22 +205,22 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
         lost = has_panoramas(names) and observations(data, scene).is_empty  # then there is nothing to compare them by
         remedy = points_remedy(data.path, names) if lost else prepare_command(data)
         remedy = f"; {remedy}" if data.priors is None else ""
-        emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
-        return Alignment(0.0, {})
+        emit(Warned(f"{data.path} has no depth priors, so {SWITCHED_OFF}{remedy}"))
+        return DepthAlignment(0.0, {})
     tracks = observations(data, scene)
     verdict = judge(data, scene, maps, tracks)
     straight = verdict.straight
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene, straight), scene.train))
-    fits = [answer if isinstance(answer, Fit) else None for answer in answers]
+    fits = [answer if isinstance(answer, ScaleOffsetFit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
     unfit = dict.fromkeys(_outliers(fits, band), "its scale is far from that of the other images")
     for at, reason in (unfit | in_other_units([fit and fit.unit for fit in fits])).items():
         reasons[scene.train[at].name] = reason
         fits[at] = None
     if not any(fits):
-        emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {list_reasons(reasons)}"))
-        return Alignment(0.0, {})
+        emit(Warned(f"no depth prior of {data.path} can be used, so {SWITCHED_OFF}: {list_reasons(reasons)}"))
+        return DepthAlignment(0.0, {})
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {list_reasons(reasons)}"))
     _warn_of_leaks(data, scene)
@@ -232,12 +234,12 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
     if normals and (text := normals_warning(data, [maps[name] for name in found])):
         emit(Warned(text))
-    return Alignment(typical_inverse_depth(scene.train, tracks, scene), found, straight)
+    return DepthAlignment(typical_inverse_depth(scene.train, tracks, scene), found, straight)
 
 
 def trust_warning(share: float) -> str | None:
     """A warning about depth maps with a low share of trusted pixels; None where it is high enough."""
-    if share >= HARDLY:
+    if share >= MIN_TRUSTED_SHARE:
         return None
     causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
     return f"only {share:.1%} of the pixels of the depth maps are trusted; see whether the photographs {causes}"
@@ -263,11 +265,13 @@ def list_reasons(reasons: Mapping[str, str]) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names) if more <= 1 else f"{', '.join(names[:NAMED])} and {more:,} others"
+    more = len(names) - LISTED_PHOTOS
+    return ", ".join(names) if more <= 1 else f"{', '.join(names[:LISTED_PHOTOS])} and {more:,} others"
 
 
-def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene, straight: bool) -> Fit | str:
+def _fit(
+    view: View, file: DepthFile | None, observations: Observations, scene: Scene, straight: bool
+) -> ScaleOffsetFit | str:
     """How the map of a view becomes inverse depth, or why it cannot."""
     if file is None:
         return "no map"
@@ -277,14 +281,14 @@ def _fit(view: View, file: DepthFile | None, observations: Observations, scene: 
         lens, either = lens_in(view, file, values.shape, straight), fits_both(view, file, values.shape)
         _check_map(values, view, lens)
         _check_beside(values, {"confidence": confidence, "normals": normal})
-        trusted = 1.0 if confidence is None else float((confidence > TRUSTED).mean())
+        trusted = 1.0 if confidence is None else float((confidence > MIN_TRUSTED_CONFIDENCE).mean())
         at, inverse, tracked = points_in(view, observations, scene, guess=file.aligned)
         at = at if lens is None else distorted(at, lens)
         if not file.aligned:
             scale, offset = align(sample(values, at), inverse)
-            return Fit(file, scale, offset, trusted, None, straight, lens, either)
+            return ScaleOffsetFit(file, scale, offset, trusted, None, straight, lens, either)
         unit = unit_of(values / scene.frame.scale, at, inverse, tracked)
-        return Fit(file, 1 / scene.frame.scale, 0.0, trusted, unit, straight, lens, either)
+        return ScaleOffsetFit(file, 1 / scene.frame.scale, 0.0, trusted, unit, straight, lens, either)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
 
@@ -308,7 +312,7 @@ def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -
             raise BadInput(f"it has {width} x {height} px, and its {what} {size}")
 
 
-def _outliers(fits: Sequence[Fit | None], band: tuple[float, float]) -> list[int]:
+def _outliers(fits: Sequence[ScaleOffsetFit | None], band: tuple[float, float]) -> list[int]:
     """Positions of the images whose alignment failed; maps that came in input units share one scale."""
     scales = {at: fit.scale for at, fit in enumerate(fits) if fit is not None and not fit.file.aligned}
     if not scales:

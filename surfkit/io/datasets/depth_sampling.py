@@ -11,9 +11,9 @@ from surfkit.io.datasets.undistort import warp
 from surfkit.scene.align import sample
 from surfkit.scene.scene import Lens
 
-EDGE = 0.05
+MAX_SMOOTH_STEP = 0.05
 """Neighbouring pixels whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
-WHOLE = 1 - 1e-4
+MIN_KNOWN_SHARE = 1 - 1e-4
 """Share of known neighbours from which on all of them are known, but for rounding."""
 
 
@@ -49,7 +49,7 @@ def straightened(inverse: Tensor, lens: Lens) -> Tensor:
     both = torch.stack([source, (source > 0).to(source.dtype)])[None]
     near = grid_sample(both[:, :1], grid, "nearest", "border", align_corners=False)[0, 0]
     smooth, full = grid_sample(both, grid, "bilinear", "border", align_corners=False)[0]
-    return _joined(near, smooth, full > WHOLE) * inside
+    return _joined(near, smooth, full > MIN_KNOWN_SHARE) * inside
 
 
 def straightened_nearest(values: Tensor, lens: Lens) -> Tensor:
@@ -67,4 +67,4 @@ def distorted(at: np.ndarray, lens: Lens) -> np.ndarray:
 
 def _joined(near: Tensor, smooth: Tensor, known: Tensor) -> Tensor:
     """The smooth values where all that they are made of lies on one surface, else the nearest ones."""
-    return torch.where(known & ((smooth - near).abs() < EDGE * near), smooth, near)
+    return torch.where(known & ((smooth - near).abs() < MAX_SMOOTH_STEP * near), smooth, near)

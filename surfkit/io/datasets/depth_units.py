@@ -12,21 +12,21 @@ from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, sample
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
-UNITS = 1.25
+MAX_UNIT_RATIO = 1.25
 """A map in input units that is off by a larger factor from the sparse points that its photograph shows is in others."""
-UNSEEN_UNITS = 2.0
+MAX_UNSEEN_RATIO = 2.0
 """The same where it is not known which points a photograph shows: some lie behind what it shows."""
-FAR_EXTENTS = 200.0
+MAX_DEPTH_EXTENTS = 200.0
 """Maps whose median depth is more scene extents, or less than one part in so many, are said to be in another unit."""
-CELLS = 24
+CELLS_PER_SIDE = 24
 """Of the points in a cell of a grid of so many a side over a photograph, the nearest one is taken to be in view."""
-MOST_POINTS = 100_000
+MAX_PROJECTED_POINTS = 100_000
 """Sparse points that are projected, at most."""
-KNOWN = (1000.0, 100.0, 39.37, 12.0, 10.0, 3.2808, 1 / 0.9144)
+KNOWN_RATIOS = (1000.0, 100.0, 39.37, 12.0, 10.0, 3.2808, 1 / 0.9144)
 """Ratios of units: m to mm, cm, inch; foot to inch; cm to mm; m to foot; m to yard."""
-NEAR_KNOWN = 0.03
+KNOWN_RATIO_TOLERANCE = 0.03
 """A factor is told as a known ratio if it is off by a smaller share."""
-ADVICE = (
+UNIT_ADVICE = (
     "correct what the data set says of their unit (depth_unit_scale_factor or integer_depth_scale in transforms.json, "
     "scale in depth_params.json, --metres-per-unit), or make others with `surfkit prepare depth`"
 )
@@ -79,7 +79,7 @@ def points_in(view: View, observations: Observations, scene: Scene, guess: bool)
     at, inverse = observations.of(view, MAX_ERROR_PX)
     if not guess or not observations.is_empty or scene.cloud.drawn:
         return at, inverse, True
-    xyz = scene.cloud.xyz[:: max(1, -(-len(scene.cloud.xyz) // MOST_POINTS))].to(torch.float64).numpy()
+    xyz = scene.cloud.xyz[:: max(1, -(-len(scene.cloud.xyz) // MAX_PROJECTED_POINTS))].to(torch.float64).numpy()
     camera = view.camera
     pose = camera.world_to_camera.cpu().numpy()
     local = xyz @ pose[:3, :3].T + pose[:3, 3]
@@ -89,7 +89,7 @@ def points_in(view: View, observations: Observations, scene: Scene, guess: bool)
     inside = ((share >= 0) & (share < 1)).all(1)
     share, z = share[inside], local[inside, 2]
     order = np.argsort(z, kind="stable")
-    cells = (share[order] * CELLS).astype(np.int64) @ (1, CELLS)
+    cells = (share[order] * CELLS_PER_SIDE).astype(np.int64) @ (1, CELLS_PER_SIDE)
     nearest = order[np.unique(cells, return_index=True)[1]]
     return share[nearest], 1 / z[nearest], False
 
@@ -104,14 +104,17 @@ def in_other_units(units: Sequence[Unit | None]) -> dict[int, str]:
     """
     ratios = {at: unit.ratio for at, unit in enumerate(units) if unit is not None and unit.ratio is not None}
     loose = [at for at in ratios if not units[at].tracked]  # type: ignore[union-attr]
-    off = {at: r for at, r in ratios.items() if at not in set(loose) and not 1 / UNITS < r < UNITS}
-    if loose and not 1 / UNSEEN_UNITS < np.median([ratios[at] for at in loose]) < UNSEEN_UNITS:
+    off = {at: r for at, r in ratios.items() if at not in set(loose) and not 1 / MAX_UNIT_RATIO < r < MAX_UNIT_RATIO}
+    if loose and not 1 / MAX_UNSEEN_RATIO < np.median([ratios[at] for at in loose]) < MAX_UNSEEN_RATIO:
         off |= {at: ratios[at] for at in loose}
     if not off:
         return {}
     middle = float(np.median(list(off.values())))
-    alike = [at for at, ratio in off.items() if 1 / UNSEEN_UNITS < ratio / middle < UNSEEN_UNITS]
-    same = f"its depths are not those of the sparse points, but {factor(middle)} times as large, a wrong unit: {ADVICE}"
+    alike = [at for at, ratio in off.items() if 1 / MAX_UNSEEN_RATIO < ratio / middle < MAX_UNSEEN_RATIO]
+    same = (
+        f"its depths are not those of the sparse points, but {factor(middle)} times as large, a wrong unit: "
+        f"{UNIT_ADVICE}"
+    )
     return {at: same if at in alike else "its depths are not those of the sparse points" for at in off}
 
 
@@ -121,14 +124,14 @@ def far_warning(units: Sequence[Unit | None], scene: Scene) -> str | None:
     if not scene.cloud.drawn or not depths:
         return None
     extents = float(np.median(depths))
-    if 1 / FAR_EXTENTS < extents < FAR_EXTENTS:
+    if 1 / MAX_DEPTH_EXTENTS < extents < MAX_DEPTH_EXTENTS:
         return None
     where = f"what is in view {extents:,.3g} times as far away as the cameras lie apart"
-    return f"the depth maps put {where}: they seem to be in another unit than the cameras; {ADVICE}"
+    return f"the depth maps put {where}: they seem to be in another unit than the cameras; {UNIT_ADVICE}"
 
 
 def factor(ratio: float) -> str:
     """A factor in words, as a known one where it is near one."""
     up = max(ratio, 1 / ratio)
-    up = next((known for known in KNOWN if abs(up / known - 1) < NEAR_KNOWN), up)
+    up = next((known for known in KNOWN_RATIOS if abs(up / known - 1) < KNOWN_RATIO_TOLERANCE), up)
     return f"{up if ratio > 1 else 1 / up:,.4g}"

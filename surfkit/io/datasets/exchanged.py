@@ -12,7 +12,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.camera_files import numbers
 from surfkit.scene.crs import axes_of, code_in, from_wkt, in_plan, metres_of
 
-UNIT = re.compile(r"UNIT\s*\[", re.IGNORECASE)
+UNIT_PATTERN = re.compile(r"UNIT\s*\[", re.IGNORECASE)
 """A unit in well-known text; where there is none, pyproj takes metres."""
 
 
@@ -59,7 +59,7 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
             return code_in(given) or text, metres_of(given)
         if not given.is_engineering:
             raise BadInput(degrees)
-        return None, metres_of(given) if UNIT.search(text) else None
+        return None, metres_of(given) if UNIT_PATTERN.search(text) else None
     if text.upper().replace(" ", "") in ("WGS84", "WGS1984"):
         raise BadInput(degrees)
     if "local" not in text.lower():

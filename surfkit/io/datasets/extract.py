@@ -14,10 +14,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, from_json
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import replacing
-from surfkit.io.datasets.depth_prior import Alignment
+from surfkit.io.datasets.depth_prior import DepthAlignment
 from surfkit.scene.camera import Camera
-from surfkit.scene.pixels import PLAIN, Pixels
-from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
+from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Extract:
     """
 
     scene: Scene
-    priors: Alignment | None
+    priors: DepthAlignment | None
 
 
 @dataclass(frozen=True)
-class Shot:
+class ExtractedView:
     """A view but for its pose, as in the file."""
 
     name: str
@@ -44,23 +44,23 @@ class Shot:
     lens: tuple[float, float, float, float]
     size: tuple[int, int]
     bent: Lens | None = None
-    pixels: Pixels = PLAIN
+    pixels: Pixels = DEFAULT_PIXELS
 
 
 @dataclass(frozen=True)
-class Facts:
+class ExtractHeader:
     """What is not in arrays."""
 
     name: str
-    shots: tuple[Shot, ...]
+    shots: tuple[ExtractedView, ...]
     scale: float
     metres: float | None
     crs: str | None
     shift: tuple[float, float, float]
-    priors: Alignment | None
+    priors: DepthAlignment | None
 
 
-def of(scene: Scene, names: Iterable[str], priors: Alignment | None) -> Extract:
+def of(scene: Scene, names: Iterable[str], priors: DepthAlignment | None) -> Extract:
     """The training views of these names alone; `priors` are those of the whole scene."""
     wanted = set(names)
     part = _scene(scene.name, tuple(view for view in scene.train if view.name in wanted), scene.frame)
@@ -69,18 +69,18 @@ def of(scene: Scene, names: Iterable[str], priors: Alignment | None) -> Extract:
 
 
 def _scene(name: str, views: tuple[View, ...], frame: Frame) -> Scene:
-    return Scene(name, views, (), Cloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), frame)
+    return Scene(name, views, (), SparsePoints(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), frame)
 
 
 def save(path: Path, made: Extract) -> None:
     """Write an extract."""
     scene, frame = made.scene, made.scene.frame
     shots = tuple(
-        Shot(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height), v.lens, v.pixels)
+        ExtractedView(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height), v.lens, v.pixels)
         for v in scene.train
         for c in [v.camera]
     )
-    facts = Facts(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, made.priors)
+    facts = ExtractHeader(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, made.priors)
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.train])
     arrays = {"facts": np.array(json.dumps(dump(facts))), "poses": poses, "origin": frame.origin}
     with replacing(path) as file:
@@ -112,7 +112,7 @@ def load(path: Path) -> Extract:
 
 
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:
-    facts = load_value(Facts, from_json(str(arrays["facts"])))
+    facts = load_value(ExtractHeader, from_json(str(arrays["facts"])))
     views = tuple(
         View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white, s.bent, s.pixels)
         for s, pose in zip(facts.shots, arrays["poses"], strict=True)

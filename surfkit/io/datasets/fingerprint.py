@@ -14,12 +14,12 @@ from torch import Tensor
 from surfkit.io.datasets.depth_files import DepthFile, confidence_path, normal_path
 from surfkit.scene.scene import Scene, View
 
-PIECE = 1 << 16
+PIECE_BYTES = 1 << 16
 """Bytes that are read at the start, in the middle and at the end of a photograph."""
 
 
 @dataclass(frozen=True)
-class Stamp:
+class FileStamp:
     """What is known of a file beside a photograph.
 
     Attributes:
@@ -37,7 +37,7 @@ class Stamp:
 
 
 @dataclass(frozen=True)
-class Print:
+class PhotoFingerprint:
     """What is known of one photograph.
 
     Attributes:
@@ -54,7 +54,7 @@ class Print:
     time_ns: int
     content: str
     held_out: bool
-    beside: dict[str, Stamp] = field(default_factory=dict)
+    beside: dict[str, FileStamp] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Fingerprint:
     """
 
     points: str
-    photographs: dict[str, Print]
+    photographs: dict[str, PhotoFingerprint]
     beside: bool = False
-    files: dict[str, Stamp] = field(default_factory=dict)
+    files: dict[str, FileStamp] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def changed_file(old: Fingerprint, new: Fingerprint) -> str | None:
     return next((path for path in both if old.files[path].content != new.files[path].content), None)
 
 
-def _beside_changed(old: Mapping[str, Stamp], new: Mapping[str, Stamp]) -> str | None:
+def _beside_changed(old: Mapping[str, FileStamp], new: Mapping[str, FileStamp]) -> str | None:
     """What beside a photograph is not what it was."""
     for what in (*old, *new):
         a, b = old.get(what), new.get(what)
@@ -177,11 +177,13 @@ def _feed(found: Any, value: Any) -> None:
         found.update(f"\0{value!r}".encode())
 
 
-def _print(view: View, held_out: bool, before: Print | None, maps: Mapping[str, DepthFile]) -> Print:
+def _print(
+    view: View, held_out: bool, before: PhotoFingerprint | None, maps: Mapping[str, DepthFile]
+) -> PhotoFingerprint:
     photo = _stamp(view.path, before)
     known = before.beside if before else {}
     beside = {what: _stamp(path, known.get(what), meaning) for what, path, meaning in _beside(view, maps)}
-    return Print(digest(view.camera), photo.size, photo.time_ns, photo.content, held_out, beside)
+    return PhotoFingerprint(digest(view.camera), photo.size, photo.time_ns, photo.content, held_out, beside)
 
 
 def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Path, str]]:
@@ -196,21 +198,27 @@ def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Pa
             yield "normal map", path, ""
 
 
-def _stamp(path: Path, before: Stamp | Print | None, meaning: str = "", whole: bool = False) -> Stamp:
+def _stamp(
+    path: Path, before: FileStamp | PhotoFingerprint | None, meaning: str = "", whole: bool = False
+) -> FileStamp:
     try:
         state = path.stat()
         same = before is not None and (before.size, before.time_ns) == (state.st_size, state.st_mtime_ns)
         content = before.content if same else _content(path, state.st_size, whole)
     except OSError:
-        return Stamp(-1, 0, "", meaning)
-    return Stamp(state.st_size, state.st_mtime_ns, content, meaning)
+        return FileStamp(-1, 0, "", meaning)
+    return FileStamp(state.st_size, state.st_mtime_ns, content, meaning)
 
 
 def _content(path: Path, size: int, whole: bool) -> str:
     found = hashlib.sha256()
-    pieces = range(0, size, PIECE) if whole else sorted({0, max(0, (size - PIECE) // 2), max(0, size - PIECE)})
+    pieces = (
+        range(0, size, PIECE_BYTES)
+        if whole
+        else sorted({0, max(0, (size - PIECE_BYTES) // 2), max(0, size - PIECE_BYTES)})
+    )
     with path.open("rb") as file:
         for start in pieces:
             file.seek(start)
-            found.update(file.read(PIECE))
+            found.update(file.read(PIECE_BYTES))
     return found.hexdigest()[:20]

@@ -12,21 +12,21 @@ from pyproj.exceptions import ProjError
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.georeference import Similarity
-from surfkit.scene.crs import POLAR, code_in, exact, from_wkt, in_plan, zone_of
-from surfkit.scene.earth import AXIS, FLATTENING, to_ecef, utm
+from surfkit.scene.crs import MAX_UTM_LATITUDE, code_in, exact, from_wkt, in_plan, zone_of
+from surfkit.scene.earth import FLATTENING, SEMI_MAJOR_AXIS_M, to_ecef, utm
 
 WGS84 = ("EPSG:4326", "EPSG:4979")
-RADIUS_M = (6.2e6, 6.5e6)
+EARTH_RADIUS_M = (6.2e6, 6.5e6)
 """Distances from the Earth's centre at which there are photographs."""
 OnMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(P, 2) east and north of (P,) latitudes and longitudes, degrees."""
 Convert = Callable[[np.ndarray], np.ndarray]
 """(P, 3) coordinates on the map of (P, 3) about the Earth's centre."""
-STEP_M = 100.0
+AXIS_STEP_M = 100.0
 """Over which the directions of the axes are measured."""
-QUIET_M = 0.1
+QUIET_SHIFT_M = 0.1
 """Distances between a camera and its place on the map that are not told of."""
-FAR_M = 1e5
+MAX_CAMERA_DISTANCE_M = 1e5
 """A camera that is farther from the others is a mistake."""
 
 
@@ -70,7 +70,7 @@ def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
             "coordinate reference system, and export again"
         )
     middle = centres.mean(0)
-    if not RADIUS_M[0] < np.linalg.norm(middle) < RADIUS_M[1]:
+    if not EARTH_RADIUS_M[0] < np.linalg.norm(middle) < EARTH_RADIUS_M[1]:
         emit(
             Warned(
                 f"{where}: {flat.name!r}, but the cameras are not on the Earth: their coordinates are taken as local"
@@ -105,7 +105,7 @@ def topocentric_to_utm(local: str, crs: str) -> Convert:
     return convert
 
 
-def geodetic(xyz: np.ndarray, axis: float = AXIS, flattening: float = FLATTENING) -> np.ndarray:
+def geodetic(xyz: np.ndarray, axis: float = SEMI_MAJOR_AXIS_M, flattening: float = FLATTENING) -> np.ndarray:
     """(P, 3) latitude and longitude, degrees, and height, of (P, 3) metres from the centre of an ellipsoid."""
     squared = flattening * (2 - flattening)
     away = np.hypot(xyz[:, 0], xyz[:, 1])
@@ -119,9 +119,9 @@ def geodetic(xyz: np.ndarray, axis: float = AXIS, flattening: float = FLATTENING
 
 def _similarity(where: str, convert: Convert, middle: np.ndarray) -> Similarity:
     """From coordinates about the Earth's centre to the map, exact in a point and in the directions there."""
-    steps = STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    steps = AXIS_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
     around = convert(middle + steps)
-    east, north, up = ((around[:3] - around[3:]) / (2 * STEP_M)).T
+    east, north, up = ((around[:3] - around[3:]) / (2 * AXIS_STEP_M)).T
     if not np.isfinite([east, north, up]).all() or not np.cross(east, north) @ up > 0:
         raise BadInput(f"{where}: its axes are not east, north and up at the cameras; export in another system")
     scale = float(np.sqrt(np.linalg.norm(east) * np.linalg.norm(north)))
@@ -143,10 +143,10 @@ def warn_of_bend(where: str, name: str, move: Similarity, metres: float, convert
         convert: The exact way to the map.
         centres: (V, 3) of the cameras.
     """
-    near = centres[np.linalg.norm(centres - np.median(centres, axis=0), axis=1) <= FAR_M]
+    near = centres[np.linalg.norm(centres - np.median(centres, axis=0), axis=1) <= MAX_CAMERA_DISTANCE_M]
     away = np.linalg.norm(move.points(near) - convert(near), axis=1)
     off = float(away[np.isfinite(away)].max(initial=0)) * metres
-    if off > QUIET_M:
+    if off > QUIET_SHIFT_M:
         emit(
             Warned(
                 f"{where}: the Earth is round, {name!r} is flat: at the outermost camera, coordinates are {off:.2f} m "
@@ -171,7 +171,7 @@ def _projection(where: str, text: str, flat: CRS, at: np.ndarray) -> tuple[str, 
     code = code_in(flat)
     zone = zone_of(code or "")
     if flat.is_geographic:
-        if abs(at[0]) > POLAR:
+        if abs(at[0]) > MAX_UTM_LATITUDE:
             raise BadInput(f"{where}: degrees at latitude {at[0]:.1f}, where UTM ends; choose a projected system")
         zone = (int((at[1] + 180) // 6) % 60 + 1, bool(at[0] < 0))
     utm_crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}" if zone is not None else None

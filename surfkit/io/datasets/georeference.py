@@ -14,12 +14,12 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.systems import system_of
-from surfkit.scene.crs import BESIDE, POLAR, zone_of
-from surfkit.scene.earth import AXIS, FLATTENING, utm
+from surfkit.scene.crs import MAX_UTM_LATITUDE, MAX_UTM_OFFSET_DEGREES, zone_of
+from surfkit.scene.earth import FLATTENING, SEMI_MAJOR_AXIS_M, utm
 
-MOST_M = 1e8
+MAX_COORDINATE_M = 1e8
 """No coordinate on Earth is larger, metres."""
-FOLDER = "odm_georeferencing"
+ODM_FOLDER = "odm_georeferencing"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Similarity:
 
 
 @dataclass(frozen=True)
-class Place:
+class GeoPlacement:
     """A reconstruction on Earth.
 
     Attributes:
@@ -59,7 +59,7 @@ class Place:
     local: str | None = None
 
 
-def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> Place | None:
+def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> GeoPlacement | None:
     """Where a reconstruction of OpenSfM lies, in UTM if OpenDroneMap chose a zone; None if it has no GPS.
 
     Args:
@@ -73,26 +73,30 @@ def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: f
         return None
     latitude, longitude, altitude = reference
     local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
-    lines = _lines(root / FOLDER / "coords.txt")
-    texts = [*lines[:1], *_lines(root / FOLDER / "proj.txt")[:1]]
+    lines = _lines(root / ODM_FOLDER / "coords.txt")
+    texts = [*lines[:1], *_lines(root / ODM_FOLDER / "proj.txt")[:1]]
     zone = next(filter(None, map(_zone, texts)), None)
-    if zone is None or abs(latitude) > POLAR:
+    if zone is None or abs(latitude) > MAX_UTM_LATITUDE:
         if texts:
             emit(
                 Warned(
-                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM on WGS 84 at {latitude:.6f}, {longitude:.6f}: "
+                    f"{root / ODM_FOLDER}: {texts[0]!r} is no zone of UTM on WGS 84 at {latitude:.6f}, "
+                    f"{longitude:.6f}: "
                     "coordinates are metres east, north and up of there"
                 )
             )
-        return Place(local)
+        return GeoPlacement(local)
     number, south = zone
-    if not abs((longitude - (6 * number - 183) + 180) % 360 - 180) < BESIDE:
+    if not abs((longitude - (6 * number - 183) + 180) % 360 - 180) < MAX_UTM_OFFSET_DEGREES:
         raise BadInput(
-            f"{root / FOLDER}: zone {number} of UTM is far from the reconstruction's {latitude:.6f}, {longitude:.6f}; "
+            f"{root / ODM_FOLDER}: zone {number} of UTM is far from the reconstruction's {latitude:.6f}, "
+            f"{longitude:.6f}; "
             "run OpenDroneMap again, or delete coords.txt and proj.txt"
         )
-    shift = _offset(root / FOLDER / "coords.txt", lines)
-    return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift, local)
+    shift = _offset(root / ODM_FOLDER / "coords.txt", lines)
+    return GeoPlacement(
+        f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift, local
+    )
 
 
 def _onto_map(reference: tuple[float, float, float], zone: tuple[int, bool], height: float) -> Similarity:
@@ -100,7 +104,7 @@ def _onto_map(reference: tuple[float, float, float], zone: tuple[int, bool], hei
     latitude, longitude, altitude = reference
     squared = FLATTENING * (2 - FLATTENING)
     w = 1 - squared * math.sin(math.radians(latitude)) ** 2
-    north_m = AXIS * (1 - squared) / w**1.5 + altitude  # radius of the meridian
+    north_m = SEMI_MAJOR_AXIS_M * (1 - squared) / w**1.5 + altitude  # radius of the meridian
     a_metre = math.degrees(1 / north_m)
     step = 100.0
     upper = utm(latitude + step * a_metre, longitude, *zone)
@@ -122,7 +126,7 @@ def _reference(folder: Path, model: Mapping[str, Any]) -> tuple[float, float, fl
         values = tuple(float(given[name]) for name in ("latitude", "longitude", "altitude"))
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise BadInput(f"{path}: lacks latitude, longitude or altitude; run OpenSfM again") from error
-    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and abs(values[2]) < MOST_M):
+    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and abs(values[2]) < MAX_COORDINATE_M):
         raise BadInput(f"{path}: {values[0]:g}, {values[1]:g} at {values[2]:g} m is no place; run OpenSfM again")
     return None if values[:2] == (0, 0) else values  # type: ignore[return-value]
 
@@ -153,6 +157,6 @@ def _offset(path: Path, lines: list[str]) -> tuple[float, float, float] | None:
         east, north = (float(word) for word in lines[1].split()[:2])
     except ValueError as error:
         raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two numbers; run OpenDroneMap again") from error
-    if not (abs(east) < MOST_M and abs(north) < MOST_M):
+    if not (abs(east) < MAX_COORDINATE_M and abs(north) < MAX_COORDINATE_M):
         raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two lengths on Earth; run OpenDroneMap again")
     return east, north, 0.0

@@ -9,15 +9,15 @@ from pathlib import Path
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
-from surfkit.io.datasets.depth_files import FOLDER
+from surfkit.io.datasets.depth_files import DEPTH_FOLDER
 
-NAME = "depth"
+MADE_MAPS_FOLDER = "depth"
 """Of the folder in the cache; one folder in it for each data set, estimator and way to read the data set."""
-RECORD = "made.json"
+MADE_MAPS_RECORD = "made.json"
 
 
 @dataclass(frozen=True)
-class Made:
+class DepthMapIndex:
     """What is known of the maps in a folder.
 
     Attributes:
@@ -35,25 +35,25 @@ class Made:
 
 def folder_of(key: str) -> Path:
     """The folder of maps in the cache, whose estimated_depths/ has the layout of that of a data set."""
-    return cache_root() / NAME / key
+    return cache_root() / MADE_MAPS_FOLDER / key
 
 
-def read_made(folder: Path) -> Made:
+def read_made(folder: Path) -> DepthMapIndex:
     """What is known of the maps in a folder; nothing where there are none, or the file that tells it is damaged."""
-    path = folder / RECORD
+    path = folder / MADE_MAPS_RECORD
     with suppress(BadInput):
-        return read_json(path, Made) if path.exists() else Made()
-    return Made()
+        return read_json(path, DepthMapIndex) if path.exists() else DepthMapIndex()
+    return DepthMapIndex()
 
 
-def write_made(folder: Path, made: Made) -> None:
+def write_made(folder: Path, made: DepthMapIndex) -> None:
     """Write down what is known of them."""
-    write_json(folder / RECORD, made)
+    write_json(folder / MADE_MAPS_RECORD, made)
 
 
 def is_there(folder: Path) -> bool:
     """Whether maps that a run was given can be found, in this cache or where they were then."""
-    return any((place / FOLDER).is_dir() for place in (folder, folder_of(folder.name)))
+    return any((place / DEPTH_FOLDER).is_dir() for place in (folder, folder_of(folder.name)))
 
 
 def located(folder: Path) -> Path:
@@ -67,4 +67,4 @@ def located(folder: Path) -> Path:
             f"the depth maps that were made for the run are neither in {folder} nor in {folder_of(folder.name)}; give "
             "its surfkit train command again, or, on another machine, set SURFKIT_CACHE to a folder that both see"
         )
-    return folder if (folder / FOLDER).is_dir() else folder_of(folder.name)
+    return folder if (folder / DEPTH_FOLDER).is_dir() else folder_of(folder.name)

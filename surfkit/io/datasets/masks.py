@@ -15,24 +15,24 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.io.datasets.capture import Shot
-from surfkit.io.datasets.pixels import Decided
+from surfkit.io.datasets.capture import RawImage
+from surfkit.io.datasets.pixels import PixelInterpretation
 from surfkit.scene.cache import Cache
 from surfkit.scene.photos import open_header, open_picture, photo_size
 from surfkit.scene.pixels import has_opacity, opacity_of
 from surfkit.scene.scene import Mask, View
 
-FOLDER = "masks"
-MARKS = (".mask", "_mask")
+MASKS_FOLDER = "masks"
+MASK_MARKS = (".mask", "_mask")
 """What may follow the name of a photograph, before the ending."""
-LABELLED, MOST_LABELS = 0.01, 16
+MIN_LABELLED_SHARE, MAX_LABEL_VALUES = 0.01, 16
 """Share of the pixels left out that are not black, and number of different values, up to which a mask may be one of
 labels."""
-ENDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-THREADS = 4
+MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+READER_THREADS = 4
 
 
-def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[str, Mask]:
+def find_masks(root: Path, folder: Path | None, shots: Sequence[RawImage]) -> dict[str, Mask]:
     """The mask of each photograph that has one, by name.
 
     Masks are those that the data set names; `masks/NAME.png` or `masks/STEM.png` with the folders of the photograph or
@@ -61,7 +61,7 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[s
     if by_colours := [name for name, mask in masks.items() if not mask.alpha]:
         emit(Warned(f"what is black in their masks is ignored in {len(by_colours)} of {len(shots)} photographs"))
     elif not found and known:
-        emit(Warned(f"none of the {len(known)} masks has the name of a photograph; call them {FOLDER}/NAME.png"))
+        emit(Warned(f"none of the {len(known)} masks has the name of a photograph; call them {MASKS_FOLDER}/NAME.png"))
     if cut_out:
         count = f"{len(found) - len(by_colours)} of {len(shots)} photographs"
         emit(
@@ -73,7 +73,7 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[s
     return masks
 
 
-def with_opacity(masks: Mapping[str, Mask], shots: Sequence[Shot], decided: Decided) -> dict[str, Mask]:
+def with_opacity(masks: Mapping[str, Mask], shots: Sequence[RawImage], decided: PixelInterpretation) -> dict[str, Mask]:
     """Masks by name, with photographs whose own opacity is the mask; a mask that is there already goes before it."""
     both, own = [], {}
     for shot in shots:
@@ -127,7 +127,11 @@ def _has_labels(values: np.ndarray, kept: np.ndarray) -> bool:
     """Whether much of what the values (H, W) of a mask leave out is not their least one, as in a picture of labels; not
     so soft edges and the noise of JPEG, which have many values."""
     below = values[~kept]
-    return bool(below.size) and (below > below.min()).mean() > LABELLED and len(np.unique(values)) <= MOST_LABELS
+    return (
+        bool(below.size)
+        and (below > below.min()).mean() > MIN_LABELLED_SHARE
+        and len(np.unique(values)) <= MAX_LABEL_VALUES
+    )
 
 
 @lru_cache(maxsize=256)
@@ -220,10 +224,10 @@ def _cut_out(paths: Sequence[Path]) -> tuple[set[Path], Path | None]:
 
     They are all that have such a channel, if one has transparent pixels. Only these are decoded, up to that one.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(READER_THREADS) as pool:
         having = [path for path, has in zip(paths, pool.map(_has_alpha, paths), strict=True) if has]
-        for at in range(0, len(having), THREADS):
-            some = having[at : at + THREADS]
+        for at in range(0, len(having), READER_THREADS):
+            some = having[at : at + READER_THREADS]
             if clear := [path for path, is_clear in zip(some, pool.map(_is_clear, some), strict=True) if is_clear]:
                 return set(having), clear[0]
             emit(Progress("looking at masks", at + len(some), len(having)))
@@ -255,7 +259,7 @@ def _decoded_is_clear(path: Path, size: int, time_ns: int) -> bool:
 
 def _folders(root: Path, folder: Path | None) -> list[Path]:
     if folder is None:
-        return sorted(path for path in root.rglob(FOLDER) if path.is_dir())
+        return sorted(path for path in root.rglob(MASKS_FOLDER) if path.is_dir())
     if not (root / folder).is_dir():
         raise BadInput(f"--masks {root / folder}: no such folder of masks")
     return [root / folder]
@@ -266,27 +270,27 @@ def _index(folders: Sequence[Path]) -> dict[str, set[Path]]:
     known: dict[str, set[Path]] = {}
     for folder in folders:
         for path in sorted(folder.rglob("*")):
-            if path.suffix.lower() in ENDS and path.is_file():
+            if path.suffix.lower() in MASK_SUFFIXES and path.is_file():
                 name = PurePosixPath(path.relative_to(folder).as_posix())
                 meant = str(name.with_suffix("")).lower()
-                for mark in MARKS:
+                for mark in MASK_MARKS:
                     meant = meant.removesuffix(mark)
                 for key in (meant, PurePosixPath(meant).name):
                     known.setdefault(key, set()).add(path)
     return known
 
 
-def _of(shot: Shot, known: dict[str, set[Path]]) -> Path | None:
+def _of(shot: RawImage, known: dict[str, set[Path]]) -> Path | None:
     """The mask of a photograph, by the first of its names that belongs to one mask only."""
     for name in _names(shot):
         if len(masks := known.get(name.lower(), ())) == 1:
             return next(iter(masks))
     stem = shot.path.with_suffix("").name
-    beside = (shot.path.with_name(f"{start}{mark}.png") for mark in MARKS for start in (stem, shot.path.name))
+    beside = (shot.path.with_name(f"{start}{mark}.png") for mark in MASK_MARKS for start in (stem, shot.path.name))
     return next((path for path in beside if path.is_file()), None)
 
 
-def _names(shot: Shot) -> Iterator[str]:
+def _names(shot: RawImage) -> Iterator[str]:
     """What a mask may be called without its ending: the whole path first, the mere stem last."""
     path = PurePosixPath(shot.name.replace("\\", "/"))
     yield str(path)

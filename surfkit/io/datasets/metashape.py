@@ -18,23 +18,23 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import leave_out, numbers, one_file, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.geocentric import place_of
 from surfkit.io.datasets.georeference import Similarity
 from surfkit.io.datasets.panoramas import panorama
 from surfkit.io.datasets.transforms import points
 
-HEAD = 4096
+SNIFFED_BYTES = 4096
 """Bytes of a file that are looked at to recognise it."""
-LENSES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
+FISHEYE_SENSORS = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
 """Kinds of sensors, and whether they are fisheyes."""
 SPHERICAL = "spherical"
 """Kind of a sensor whose photographs are panoramas; it has no calibration."""
-COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-NO = ("false", "0")
+CALIBRATION_FIELDS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+FALSE_WORDS = ("false", "0")
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class Metashape(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         path = one_file(data.path, _files(data.path), "XML file of Metashape's cameras; export them as Agisoft XML")
         chunk = _chunk(path)
         cameras = _cameras(path, chunk)
         names = _names(chunk, cameras)
         found = photographs(data, names)
         sensors = {sensor.get("id"): sensor for sensor in chunk.findall("sensors/sensor")}
-        lenses, known = Lenses(path), {}
+        lenses, known = LensTable(path), {}
         for number in dict.fromkeys(camera.get("sensor_id") for camera in cameras):
             with leaving_out():
                 where = f"{path}: sensor {number}"
@@ -67,8 +67,8 @@ class Metashape(Reader):
             if name in found and number in known:
                 with leaving_out():
                     pose = _pose(f"{path}: camera {name!r}", camera)
-                    shots.append(Shot(name, pose, known[number], found[name]))
-        return _placed(path, chunk, cameras[0].get("component_id"), Capture(shots, *points(data.path, {})))
+                    shots.append(RawImage(name, pose, known[number], found[name]))
+        return _placed(path, chunk, cameras[0].get("component_id"), RawDataset(shots, *points(data.path, {})))
 
 
 def _files(root: Path) -> list[Path]:
@@ -79,7 +79,7 @@ def _files(root: Path) -> list[Path]:
 def _is_cameras(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            head = file.read(HEAD)
+            head = file.read(SNIFFED_BYTES)
     except OSError:
         return False
     return b"<document" in head and b"<chunk" in head
@@ -88,7 +88,7 @@ def _is_cameras(path: Path) -> bool:
 def _chunk(path: Path) -> ElementTree.Element:
     """The chunk of most cameras with a pose, or BadInput."""
     text = read_text(path)
-    if "<!DOCTYPE" in text[:HEAD] or "<!ENTITY" in text:
+    if "<!DOCTYPE" in text[:SNIFFED_BYTES] or "<!ENTITY" in text:
         raise BadInput(
             f"{path}: has definitions of its own, which cameras exported by Metashape have not; export again"
         )
@@ -115,7 +115,7 @@ def _cameras(path: Path, chunk: ElementTree.Element) -> list[ElementTree.Element
         return [camera for camera in cameras if good(camera)]
 
     listed = chunk.findall("cameras//camera")
-    enabled = keep(listed, lambda camera: camera.get("enabled", "true").lower() not in NO, "are disabled")
+    enabled = keep(listed, lambda camera: camera.get("enabled", "true").lower() not in FALSE_WORDS, "are disabled")
     why = "have no pose of their own (not aligned, or slaves of another camera)"
     posed = keep(enabled, lambda camera: camera.find("transform") is not None, why)
     if not posed:
@@ -156,12 +156,12 @@ def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
         raise BadInput(f"{where}: no calibration of it; align the photographs, and export the cameras again")
     best = next((one for one in given if one.get("class") == "adjusted"), given[0])
     kind = best.get("type") or sensor.get("type", "")
-    if kind not in LENSES:
-        raise BadInput(f"{where}: of type {kind}; known: {', '.join((*LENSES, SPHERICAL))}")
+    if kind not in FISHEYE_SENSORS:
+        raise BadInput(f"{where}: of type {kind}; known: {', '.join((*FISHEYE_SENSORS, SPHERICAL))}")
     width, height = _size(where, best if best.find("resolution") is not None else sensor)
     if best.find("f") is None:
         raise BadInput(f"{where}: no f in its calibration; open the project in Metashape, and export the cameras again")
-    value = {name: float(numbers(f"{where}: {name}", best.findtext(name) or "0", 1)[0]) for name in COEFFICIENTS}
+    value = {name: float(numbers(f"{where}: {name}", best.findtext(name) or "0", 1)[0]) for name in CALIBRATION_FIELDS}
     return Brown(
         size=(width, height),
         focal=(value["f"] + value["b1"], value["f"]),
@@ -170,7 +170,7 @@ def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
         tangential=(value["p2"], value["p1"]),  # Metashape's p1 goes with r^2 + 2 x^2, OpenCV's with 2 x y
         higher=(value["p3"], value["p4"]),
         shear=value["b2"],
-        fisheye=LENSES[kind],
+        fisheye=FISHEYE_SENSORS[kind],
     )
 
 
@@ -182,7 +182,7 @@ def _size(where: str, element: ElementTree.Element) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _placed(path: Path, chunk: ElementTree.Element, part: str | None, capture: Capture) -> Capture:
+def _placed(path: Path, chunk: ElementTree.Element, part: str | None, capture: RawDataset) -> RawDataset:
     """The capture where the chunk, or the component of its cameras, lies; as it is in the chunk if nowhere."""
     element = chunk.find("transform")
     for component in chunk.findall("components/component"):
@@ -201,7 +201,7 @@ def _placed(path: Path, chunk: ElementTree.Element, part: str | None, capture: C
     return replace(moved, metres=place.metres, crs=place.crs)
 
 
-def _with_poses(capture: Capture, poses: list[np.ndarray]) -> Capture:
+def _with_poses(capture: RawDataset, poses: list[np.ndarray]) -> RawDataset:
     return replace(capture, shots=[replace(shot, pose=pose) for shot, pose in zip(capture.shots, poses, strict=True)])
 
 

@@ -17,18 +17,26 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.codec import read_json
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown
-from surfkit.io.datasets.camera_files import MOST, groups_of, leave_out, numbers, photographs, pose_at, tracks_of
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, shorten
+from surfkit.io.datasets.camera_files import (
+    MAX_CAMERA_NUMBER,
+    groups_of,
+    leave_out,
+    numbers,
+    photographs,
+    pose_at,
+    tracks_of,
+)
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
 
-PLACES = (
+SFM_DATA_FILES = (
     "sfm_data.json",
     "reconstruction/sfm_data.json",
     "reconstruction_sequential/sfm_data.json",
     "reconstruction_global/sfm_data.json",
 )
 """Where the file may lie, the first that is there wins."""
-LENSES = {
+INTRINSIC_FIELDS = {
     "pinhole": ("", 0),
     "pinhole_radial_k1": ("disto_k1", 1),
     "pinhole_radial_k3": ("disto_k3", 3),
@@ -36,13 +44,13 @@ LENSES = {
     "fisheye": ("fisheye", 4),
 }
 """Field of the coefficients of each kind of intrinsic, and how many there are."""
-FIRST = 1 << 31
+NEW_KIND_FLAG = 1 << 31
 """Is added to the number of a kind where its name follows."""
-CENTRE = 0.5
+FIRST_PIXEL_CENTRE = 0.5
 """Centre of the first pixel, where OpenMVG counts 0."""
-GREY = 128
+POINT_GREY = 128
 """Colour of points: the file has none."""
-DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OverflowError, IndexError)
+DAMAGE_ERRORS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, IndexError)
 
 
 @dataclass(frozen=True)
@@ -50,20 +58,20 @@ class OpenMVG(Reader):
     """OpenMVG: sfm_data.json with intrinsics and extrinsics, and images/; sparse points with their tracks."""
 
     def recognises(self, root: Path) -> bool:
-        return any((root / place).is_file() for place in PLACES)
+        return any((root / place).is_file() for place in SFM_DATA_FILES)
 
-    def read(self, data: Data) -> Capture:
-        file = _File.read(data)
+    def read(self, data: Data) -> RawDataset:
+        file = _SfmData.read(data)
         shots, (xyz, seen) = file.shots(data), file.points()
-        return Capture(shots, xyz, np.full(xyz.shape, GREY, np.uint8), groups=groups_of(shots, seen))
+        return RawDataset(shots, xyz, np.full(xyz.shape, POINT_GREY, np.uint8), groups=groups_of(shots, seen))
 
     def tracks(self, data: Data) -> Tracks:
-        file = _File.read(data)
+        file = _SfmData.read(data)
         return tracks_of(file.shots(data), *file.points())
 
 
 @dataclass(frozen=True)
-class _File:
+class _SfmData:
     """What the file says.
 
     Attributes:
@@ -77,9 +85,12 @@ class _File:
     names: Mapping[Any, str]
 
     @classmethod
-    def read(cls, data: Data) -> _File:
+    def read(cls, data: Data) -> _SfmData:
         """The file of a data set, or BadInput."""
-        path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[0])
+        path = next(
+            (data.path / place for place in SFM_DATA_FILES if (data.path / place).is_file()),
+            data.path / SFM_DATA_FILES[0],
+        )
         contents = read_json(path, Any)
         try:
             parts = {
@@ -87,7 +98,7 @@ class _File:
                 for name in ("views", "intrinsics", "extrinsics", "structure")
             }
             names = {key: _name(value) for key, value in parts["views"]}
-        except DAMAGED as error:
+        except DAMAGE_ERRORS as error:
             raise _damaged(path, error) from error
         for name, how in (
             ("views", "list the photographs"),
@@ -100,7 +111,7 @@ class _File:
                 )
         return cls(path, parts, names)
 
-    def shots(self, data: Data) -> list[Shot]:
+    def shots(self, data: Data) -> list[RawImage]:
         """The photographs with a pose."""
         try:
             lenses = self._lenses()
@@ -118,8 +129,8 @@ class _File:
                 if name in found:
                     with leaving_out():
                         pose = self._pose(name, poses[view["id_pose"]])
-                        shots.append(Shot(name, pose, lenses[view["id_intrinsic"]], found[name]))
-        except DAMAGED as error:
+                        shots.append(RawImage(name, pose, lenses[view["id_intrinsic"]], found[name]))
+        except DAMAGE_ERRORS as error:
             if isinstance(error, BadInput):
                 raise
             raise _damaged(self.path, error) from error
@@ -135,10 +146,10 @@ class _File:
                 for seen in value["observations"]
                 if seen["key"] in self.names
             ]
-            pixels = np.array([sight[2:] for sight in sights], np.float64).reshape(-1, 2) + CENTRE
-        except DAMAGED as error:
+            pixels = np.array([sight[2:] for sight in sights], np.float64).reshape(-1, 2) + FIRST_PIXEL_CENTRE
+        except DAMAGE_ERRORS as error:
             raise _damaged(self.path, error) from error
-        good = (np.abs(xyz) < MOST).all(1)
+        good = (np.abs(xyz) < MAX_CAMERA_NUMBER).all(1)
         kept = np.where(good, np.cumsum(good) - 1, -1)
         rows = np.array([sight[0] for sight in sights], np.int64)
         listed: dict[str, list[int]] = {}
@@ -153,8 +164,8 @@ class _File:
         for key, value in self.parts["intrinsics"]:
             number = int(value["polymorphic_id"])
             if "polymorphic_name" in value:
-                kinds[number % FIRST] = str(value["polymorphic_name"])
-            kind = kinds.get(number % FIRST, f"number {number}")
+                kinds[number % NEW_KIND_FLAG] = str(value["polymorphic_name"])
+            kind = kinds.get(number % NEW_KIND_FLAG, f"number {number}")
             with leaving_out():
                 lenses[key] = _camera(f"{self.path}: intrinsic {shorten(key)}", kind, value["ptr_wrapper"]["data"])
         return lenses
@@ -176,11 +187,11 @@ def _name(view: Mapping[str, Any]) -> str:
 
 def _camera(where: str, kind: str, values: Mapping[str, Any]) -> Any:
     """The pycolmap camera of an intrinsic."""
-    if kind not in LENSES:
-        raise BadInput(f"{where}: of kind {kind}; known: {', '.join(LENSES)}; cut up panoramas")
-    field, count = LENSES[kind]
+    if kind not in INTRINSIC_FIELDS:
+        raise BadInput(f"{where}: of kind {kind}; known: {', '.join(INTRINSIC_FIELDS)}; cut up panoramas")
+    field, count = INTRINSIC_FIELDS[kind]
     focal = float(numbers(where, [values["focal_length"]], 1)[0])
-    u, v = numbers(where, values["principal_point"], 2) + CENTRE
+    u, v = numbers(where, values["principal_point"], 2) + FIRST_PIXEL_CENTRE
     given = [float(value) for value in numbers(where, values[field], count)] if count else []
     size = (int(values["width"]), int(values["height"]))
     if kind == "fisheye":

@@ -14,34 +14,34 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.camera_files import MOST, read_lines, tracks_of
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, camera_of
+from surfkit.io.datasets.camera_files import MAX_CAMERA_NUMBER, read_lines, tracks_of
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.geocentric import topocentric_to_utm, warn_of_bend
 from surfkit.io.datasets.georeference import place_on_earth
 from surfkit.io.datasets.panoramas import panorama
 from surfkit.scene.names import find_files
 
-PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
+RECONSTRUCTION_FILES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
 """Where the reconstruction may lie, the first that is there wins. OpenDroneMap puts one on the map in the place of the
 second, by an affine map that no pose can follow: cameras and points no longer fit. So the topocentric one is moved."""
 TRACKS = "tracks.csv"
 """Beside the reconstruction: which photograph shows which point where."""
-WHOLE, FISHEYE = "FULL_OPENCV", "OPENCV_FISHEYE"
-LENSES = {
+FULL_MODEL, FISHEYE_MODEL = "FULL_OPENCV", "OPENCV_FISHEYE"
+PROJECTION_MODELS = {
     "perspective": ("RADIAL", ("k1", "k2")),
     "simple_radial": ("SIMPLE_RADIAL", ("k1",)),
     "radial": ("RADIAL", ("k1", "k2")),
-    "brown": (WHOLE, ("k1", "k2", "p1", "p2", "k3", "", "", "")),
+    "brown": (FULL_MODEL, ("k1", "k2", "p1", "p2", "k3", "", "", "")),
     "fisheye": ("RADIAL_FISHEYE", ("k1", "k2")),
-    "fisheye_opencv": (FISHEYE, ("k1", "k2", "k3", "k4")),
+    "fisheye_opencv": (FISHEYE_MODEL, ("k1", "k2", "k3", "k4")),
 }
 """COLMAP's name of each projection, and the coefficients that it takes."""
-PANORAMAS = ("spherical", "equirectangular")
-STRETCHED = {
-    "RADIAL": (WHOLE, ("k1", "k2", *[""] * 6)),
-    "SIMPLE_RADIAL": (WHOLE, ("k1", *[""] * 7)),
-    "RADIAL_FISHEYE": (FISHEYE, ("k1", "k2", "", "")),
+SPHERICAL_PROJECTIONS = ("spherical", "equirectangular")
+TWO_FOCAL_MODELS = {
+    "RADIAL": (FULL_MODEL, ("k1", "k2", *[""] * 6)),
+    "SIMPLE_RADIAL": (FULL_MODEL, ("k1", *[""] * 7)),
+    "RADIAL_FISHEYE": (FISHEYE_MODEL, ("k1", "k2", "", "")),
 }
 """The same for those of one focal length, where a camera has two."""
 
@@ -51,9 +51,9 @@ class ODM(Reader):
     """OpenDroneMap: images/ and opensfm/reconstruction.json; with GPS in UTM and metres if it chose a zone, z up."""
 
     def recognises(self, root: Path) -> bool:
-        return any((root / place).is_file() for place in PLACES)
+        return any((root / place).is_file() for place in RECONSTRUCTION_FILES)
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         return _read(data)[0]
 
     def tracks(self, data: Data) -> Tracks | None:
@@ -62,9 +62,12 @@ class ODM(Reader):
         return tracks_of(capture.shots, capture.xyz, _seen(path, capture, rows)) if path.is_file() else None
 
 
-def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
+def _read(data: Data) -> tuple[RawDataset, dict[str, int], Path]:
     """What is in a project, the row of each point by its number, and the folder of the reconstruction."""
-    path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[1])
+    path = next(
+        (data.path / place for place in RECONSTRUCTION_FILES if (data.path / place).is_file()),
+        data.path / RECONSTRUCTION_FILES[1],
+    )
     model = _largest(path, read_json(path, Any))
     names = sorted(model["shots"])
     folder = data.path / (data.images or "images")
@@ -85,13 +88,13 @@ def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
-    good = (np.abs(xyz) < MOST).all(1) & np.isfinite(rgb).all(1)
+    good = (np.abs(xyz) < MAX_CAMERA_NUMBER).all(1) & np.isfinite(rgb).all(1)
     rows = {number: row for row, number in enumerate(number for number, fine in zip(listed, good, strict=True) if fine)}
-    capture = Capture(shots, xyz[good], rgb[good].astype(np.uint8))
+    capture = RawDataset(shots, xyz[good], rgb[good].astype(np.uint8))
     return _on_earth(capture, data.path, path.parent, model), rows, path.parent
 
 
-def _seen(path: Path, capture: Capture, rows: Mapping[str, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _seen(path: Path, capture: RawDataset, rows: Mapping[str, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Rows of the points of each photograph, and their pixels, from OpenSfM's table of tracks.
 
     Its columns are photograph, track, feature, x and y, with tabs between; x and y are counted from the middle, as
@@ -118,7 +121,7 @@ def _seen(path: Path, capture: Capture, rows: Mapping[str, int]) -> dict[str, tu
     return found
 
 
-def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, Any]) -> Capture:
+def _on_earth(capture: RawDataset, root: Path, folder: Path, model: Mapping[str, Any]) -> RawDataset:
     """A topocentric capture where it lies on Earth; the same one if the photographs had no GPS."""
     height = float(np.median(capture.xyz[:, 2])) if len(capture.xyz) else 0.0
     place = place_on_earth(root, folder, model, height)
@@ -150,24 +153,24 @@ def _largest(path: Path, models: Any) -> Mapping[str, Any]:
 def _camera(where: str, lens: Mapping[str, Any]) -> Any:
     """The pycolmap camera of OpenSfM's normalised intrinsics: lengths are shares of the longer side."""
     kind = str(lens.get("projection_type"))
-    if kind in PANORAMAS:
+    if kind in SPHERICAL_PROJECTIONS:
         return panorama(where, (int(lens["width"]), int(lens["height"])))
-    if kind not in LENSES:
-        raise BadInput(f"{where}: projection {kind}; known: {', '.join((*LENSES, *PANORAMAS))}")
-    model, names = LENSES[kind]
+    if kind not in PROJECTION_MODELS:
+        raise BadInput(f"{where}: projection {kind}; known: {', '.join((*PROJECTION_MODELS, *SPHERICAL_PROJECTIONS))}")
+    model, names = PROJECTION_MODELS[kind]
     width, height = int(lens["width"]), int(lens["height"])
     longer = max(width, height)
     focal = [float(lens[f"focal_{axis}"] if f"focal_{axis}" in lens else lens["focal"]) * longer for axis in "xy"]
     centre = [float(lens.get("c_x", 0)) * longer + width / 2, float(lens.get("c_y", 0)) * longer + height / 2]
-    if model in STRETCHED and abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
-        model, names = STRETCHED[model]
-    elif model in STRETCHED:
+    if model in TWO_FOCAL_MODELS and abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
+        model, names = TWO_FOCAL_MODELS[model]
+    elif model in TWO_FOCAL_MODELS:
         focal = focal[:1]
     extra = [float(lens.get(name, 0)) for name in names]
     return camera_of(where, model, (width, height), [*focal, *centre, *extra])
 
 
-def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo: Path) -> Shot:
+def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo: Path) -> RawImage:
     from scipy.spatial.transform import Rotation
 
     pose = np.eye(4)
@@ -175,4 +178,4 @@ def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo:
     pose[:3, 3] = np.array(shot["translation"], np.float64)
     if not np.isfinite(pose).all():
         raise BadInput(f"the pose of {name!r} is not finite; delete the shot from reconstruction.json")
-    return Shot(name, pose, cameras[shot["camera"]], photo)
+    return RawImage(name, pose, cameras[shot["camera"]], photo)

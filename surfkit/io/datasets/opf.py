@@ -21,20 +21,20 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import groups_of, leave_out, numbers, one_file, photographs, pose_at, tracks_of
-from surfkit.io.datasets.capture import Capture, Shot, Tracks, shorten
+from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.exchanged import map_system, photo_names
-from surfkit.io.datasets.opf_points import Points, read_opf_points
+from surfkit.io.datasets.opf_points import OpfPoints, read_opf_points
 from surfkit.io.datasets.transforms import points
 
-FORMAT = "application/opf-{}+json"
-CALIBRATED, GLTF = FORMAT.format("calibrated-cameras"), "model/gltf+json"
+FORMAT_PATTERN = "application/opf-{}+json"
+CAMERAS_FORMAT, POINTS_FORMAT = FORMAT_PATTERN.format("calibrated-cameras"), "model/gltf+json"
 """Of the calibrated cameras, and of the sparse points beside them."""
 Seen = dict[str, tuple[np.ndarray, np.ndarray]]
 """By name of the photograph, rows of the points that it shows, and their pixels."""
-FLIP = np.diag([1.0, -1.0, -1.0])
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
 
 
@@ -45,7 +45,7 @@ class OPF(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         return _read(data)[0]
 
     def tracks(self, data: Data) -> Tracks | None:
@@ -59,7 +59,7 @@ class _Place:
 
     Attributes:
         shift: (3,) from the processing system to the map.
-        crs, metres: As `Capture` has them.
+        crs, metres: As `RawDataset` has them.
     """
 
     shift: np.ndarray
@@ -88,7 +88,7 @@ class _Place:
         return cls(shift, system, metres)
 
 
-def _read(data: Data) -> tuple[Capture, Seen]:
+def _read(data: Data) -> tuple[RawDataset, Seen]:
     """What is in a project, and where its sparse points were seen."""
     path = one_file(data.path, _files(data.path), "project NAME.opf; export the project as OPF")
     project = read_json(path, dict[str, Any])
@@ -110,7 +110,7 @@ def _read(data: Data) -> tuple[Capture, Seen]:
     lost = [paths[each] for each in taken if each in paths and each not in has]
     leave_out(file, photo_names(lost) if lost else [], len(has) + len(lost), "are not calibrated")
     names = photo_names([paths[each["id"]] for each in cameras])
-    found, shots, lenses, known = photographs(data, names), [], Lenses(file), {}
+    found, shots, lenses, known = photographs(data, names), [], LensTable(file), {}
     for sensor in _entries(file, calibrated, "sensors"):
         with leaving_out():
             where = f"{file}: sensor {sensor.get('id')}"
@@ -121,7 +121,7 @@ def _read(data: Data) -> tuple[Capture, Seen]:
         if name in found and each.get("sensor_id") in known:
             with leaving_out():
                 pose = _pose(f"{file}: camera {each['id']}", each, place.shift)
-                shots.append(Shot(name, pose, known[each["sensor_id"]], found[name]))
+                shots.append(RawImage(name, pose, known[each["sensor_id"]], found[name]))
     shift = tuple(place.shift.tolist()) if any(place.shift) else None
     sparse = None
     with leaving_out():
@@ -132,14 +132,14 @@ def _read(data: Data) -> tuple[Capture, Seen]:
     seen = {named[number]: each for number, each in marks.items() if number in named and len(each[0])}
     _tell_of_others(file, marks, named)
     groups = groups_of(shots, seen)
-    return Capture(shots, xyz, rgb, metres=place.metres, crs=place.crs, shift=shift, groups=groups), seen
+    return RawDataset(shots, xyz, rgb, metres=place.metres, crs=place.crs, shift=shift, groups=groups), seen
 
 
-def _sparse(path: Path, project: Mapping[str, Any]) -> Points | None:
+def _sparse(path: Path, project: Mapping[str, Any]) -> OpfPoints | None:
     """The sparse points beside the calibration that is used; None where there are none."""
     items = [_entries(path, item, "resources") for item in _entries(path, project, "items")]
-    used = [resources for resources in items if any(each.get("format") == CALIBRATED for each in resources)][-1]
-    file = next((_file(path, each) for each in used if each.get("format") == GLTF), None)
+    used = [resources for resources in items if any(each.get("format") == CAMERAS_FORMAT for each in resources)][-1]
+    file = next((_file(path, each) for each in used if each.get("format") == POINTS_FORMAT), None)
     return None if file is None else read_opf_points(file, path.parent)
 
 
@@ -171,7 +171,7 @@ def _all(path: Path, project: Mapping[str, Any], kind: str) -> Iterator[tuple[Ma
     """The contents of the files of a kind that a project names, and their paths."""
     for item in _entries(path, project, "items"):
         for resource in _entries(path, item, "resources"):
-            if resource.get("format") == FORMAT.format(kind):
+            if resource.get("format") == FORMAT_PATTERN.format(kind):
                 file = _file(path, resource)
                 yield read_json(file, dict[str, Any]), file
 
@@ -222,7 +222,7 @@ def _pose(where: str, camera: Mapping[str, Any], shift: np.ndarray) -> np.ndarra
     about_x = np.array([[1, 0, 0], [0, co, -so], [0, so, co]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     about_z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
-    return pose_at(where, FLIP @ (about_x @ about_y @ about_z).T, position + shift)
+    return pose_at(where, OPENGL_TO_OPENCV @ (about_x @ about_y @ about_z).T, position + shift)
 
 
 def _lens(where: str, sensor: Mapping[str, Any], sizes: Mapping[Any, Sequence[Any]]) -> Brown:

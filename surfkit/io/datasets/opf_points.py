@@ -20,20 +20,20 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.io.datasets.camera_files import numbers
 from surfkit.io.datasets.capture import shorten
-from surfkit.io.glb import WIDTHS
+from surfkit.io.glb import ACCESSOR_WIDTHS
 from surfkit.scene.rotations import numpy_rotations
 
-KINDS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COMPONENT_DTYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Types of glTF's components."""
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+GLTF_TO_PROJECT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From glTF's frame to that of the project."""
 MATCHES = "OPF_mesh_primitive_matches"
 OFFSET_BITS = 40
-AGAIN = "export the project again"
+EXPORT_AGAIN = "export the project again"
 
 
 @dataclass(frozen=True)
-class Points:
+class OpfPoints:
     """The points of a file.
 
     Attributes:
@@ -47,7 +47,7 @@ class Points:
     seen: dict[int, tuple[np.ndarray, np.ndarray]]
 
 
-def read_opf_points(path: Path, root: Path) -> Points:
+def read_opf_points(path: Path, root: Path) -> OpfPoints:
     """The points of a glTF file of OPF.
 
     Args:
@@ -58,16 +58,16 @@ def read_opf_points(path: Path, root: Path) -> Points:
         BadInput: A file of it is missing, cut off, or not as OPF has it.
     """
     try:
-        return _read(_File(path, root, read_json(path, dict[str, Any])))
+        return _read(_GltfFile(path, root, read_json(path, dict[str, Any])))
     except BadInput:
         raise
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         lacking = f": {error} is missing" if isinstance(error, KeyError) else ""
-        raise BadInput(f"{path}: damaged, or not as OPF has sparse points{lacking}; {AGAIN}") from error
+        raise BadInput(f"{path}: damaged, or not as OPF has sparse points{lacking}; {EXPORT_AGAIN}") from error
 
 
 @dataclass(frozen=True)
-class _File:
+class _GltfFile:
     """A glTF file, the folder of its project, and what it says."""
 
     path: Path
@@ -78,23 +78,24 @@ class _File:
         """One of the objects in a list of the file."""
         listed = self.contents.get(name, [])
         if type(at) is not int or not 0 <= at < len(listed):
-            raise BadInput(f"{self.path}: names number {shorten(at)} of its {len(listed)} {name}; {AGAIN}")
+            raise BadInput(f"{self.path}: names number {shorten(at)} of its {len(listed)} {name}; {EXPORT_AGAIN}")
         return listed[at]
 
     def values(self, accessor: Any) -> np.ndarray:
         """(N, width) what an accessor reads."""
         given = self.entry("accessors", accessor)
         view = self.entry("bufferViews", given["bufferView"])
-        if given["type"] not in WIDTHS or given["componentType"] not in KINDS:
+        if given["type"] not in ACCESSOR_WIDTHS or given["componentType"] not in COMPONENT_DTYPES:
             what = f"{shorten(given['type'])} of type {shorten(given['componentType'])}"
-            raise BadInput(f"{self.path}: accessor {accessor} is {what}, which OPF does not use; {AGAIN}")
-        width, kind = WIDTHS[given["type"]], np.dtype(KINDS[given["componentType"]])
+            raise BadInput(f"{self.path}: accessor {accessor} is {what}, which OPF does not use; {EXPORT_AGAIN}")
+        width, kind = ACCESSOR_WIDTHS[given["type"]], np.dtype(COMPONENT_DTYPES[given["componentType"]])
         if "byteStride" in view or given.get("byteOffset"):
-            raise BadInput(f"{self.path}: its buffers are interleaved, which OPF does not do; {AGAIN}")
+            raise BadInput(f"{self.path}: its buffers are interleaved, which OPF does not do; {EXPORT_AGAIN}")
         count, offset = given["count"], view.get("byteOffset", 0)
         if type(count) is not int or type(offset) is not int or min(count, offset) < 0:
             raise BadInput(
-                f"{self.path}: accessor {accessor} has {shorten(count)} values from byte {shorten(offset)} on; {AGAIN}"
+                f"{self.path}: accessor {accessor} has {shorten(count)} values from byte {shorten(offset)} on; "
+                f"{EXPORT_AGAIN}"
             )
         uri = str(self.entry("buffers", view["buffer"])["uri"])
         held = self._decoded(uri) if uri.startswith("data:") else None
@@ -119,7 +120,7 @@ class _File:
                 raise ValueError
             return b64decode(unquote(text), validate=True)
         except ValueError as error:
-            raise BadInput(f"{self.path}: a buffer in it is not in base64: {shorten(uri)}; {AGAIN}") from error
+            raise BadInput(f"{self.path}: a buffer in it is not in base64: {shorten(uri)}; {EXPORT_AGAIN}") from error
 
     def _beside(self, uri: str) -> Path:
         """The file of a buffer, or BadInput for one that is none of the project."""
@@ -127,7 +128,7 @@ class _File:
         path = Path(os.path.abspath(self.path.parent / name))
         homes = (Path(os.path.abspath(home)) for home in (self.root, self.path.parent))
         if Path(name).is_absolute() or "://" in name or not any(path.is_relative_to(home) for home in homes):
-            raise BadInput(f"{self.path}: names {shorten(name)}, which does not lie in the project; {AGAIN}")
+            raise BadInput(f"{self.path}: names {shorten(name)}, which does not lie in the project; {EXPORT_AGAIN}")
         return self.path.parent / name
 
     def moves(self) -> list[np.ndarray]:
@@ -140,7 +141,7 @@ class _File:
             above = [at]
             while (parent := parents.get(above[-1])) is not None:
                 if parent in above:
-                    raise BadInput(f"{self.path}: node {parent} is its own parent; {AGAIN}")
+                    raise BadInput(f"{self.path}: node {parent} is its own parent; {EXPORT_AGAIN}")
                 above.append(parent)
                 move = own[parent] @ move
             found.append(move)
@@ -153,7 +154,7 @@ class _File:
             return numbers(f"{where}: matrix", node["matrix"], 16).reshape(4, 4).T
         x, y, z, w = numbers(f"{where}: rotation", node.get("rotation", [0, 0, 0, 1]), 4)
         if not any((x, y, z, w)):
-            raise BadInput(f"{where}: rotation: a quaternion of zeros; {AGAIN}")
+            raise BadInput(f"{where}: rotation: a quaternion of zeros; {EXPORT_AGAIN}")
         move = np.eye(4)
         move[:3, :3] = numpy_rotations(np.array([[w, x, y, z]]))[0]
         move[:3, :3] *= numbers(f"{where}: scale", node.get("scale", [1, 1, 1]), 3)
@@ -161,7 +162,7 @@ class _File:
         return move
 
 
-def _read(file: _File) -> Points:
+def _read(file: _GltfFile) -> OpfPoints:
     xyz, rgb, begin = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], 0
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for node, local_move in zip(file.contents["nodes"], file.moves(), strict=True):
@@ -169,7 +170,7 @@ def _read(file: _File) -> Points:
             continue
         mesh = file.entry("meshes", node["mesh"])["primitives"][0]
         local = file.values(mesh["attributes"]["POSITION"]).astype(np.float64)
-        move = Z_UP @ local_move
+        move = GLTF_TO_PROJECT @ local_move
         xyz.append(local @ move[:3, :3].T + move[:3, 3])
         colour = mesh["attributes"].get("COLOR_0")
         grey = np.full(local.shape, 128, np.uint8)
@@ -178,13 +179,13 @@ def _read(file: _File) -> Points:
             before = seen.get(camera, (np.zeros(0, np.int64), np.zeros((0, 2))))
             seen[camera] = np.concatenate([before[0], rows + begin]), np.concatenate([before[1], pixels])
         begin += len(local)
-    found = Points(np.concatenate(xyz), np.concatenate(rgb), seen)
+    found = OpfPoints(np.concatenate(xyz), np.concatenate(rgb), seen)
     if not np.isfinite(found.xyz).all():
-        raise BadInput(f"{file.path}: points without finite coordinates; {AGAIN}")
+        raise BadInput(f"{file.path}: points without finite coordinates; {EXPORT_AGAIN}")
     return found
 
 
-def _matches(file: _File, given: Any, points: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _matches(file: _GltfFile, given: Any, points: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Of each camera, its identifier, rows of the points that it shows and their pixels; none if the file has none."""
     if given is None or "imagePoints" not in given:
         return []
@@ -196,7 +197,7 @@ def _matches(file: _File, given: Any, points: int) -> list[tuple[int, np.ndarray
     pixels = file.values(given["imagePoints"]["pixelCoordinates"]).astype(np.float64)
     lost = len(counts) != points or (first + counts).max(initial=0) > min(len(cameras), len(pixels))
     if lost or (len(cameras) and cameras.max() >= len(given["cameraUids"])):
-        raise BadInput(f"{file.path}: its points have matches that are not there; {AGAIN}")
+        raise BadInput(f"{file.path}: its points have matches that are not there; {EXPORT_AGAIN}")
     rows = np.repeat(np.arange(points), counts)
     at = np.repeat(first - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
     found = []

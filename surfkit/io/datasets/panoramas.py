@@ -21,12 +21,12 @@ from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import Shot, Tracks, camera_of
+from surfkit.io.datasets.capture import RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import empty_masks, read_mask
 from surfkit.io.datasets.undistort import (
-    PANORAMA,
-    Picture,
+    PANORAMA_MODEL,
+    DistortedPhoto,
     is_panorama,
     read_layers,
     resampled,
@@ -34,14 +34,14 @@ from surfkit.io.datasets.undistort import (
     save_picture,
 )
 from surfkit.scene.copies import digest, place
-from surfkit.scene.gate import Gate
-from surfkit.scene.pixels import PLAIN
+from surfkit.scene.gate import ByteSemaphore
+from surfkit.scene.pixels import DEFAULT_PIXELS
 from surfkit.scene.scene import Mask
 
-FOLDER = "panoramas"
-RECIPE = "1"
+PANORAMAS_FOLDER = "panoramas"
+CACHE_VERSION = "1"
 """Changes when the same views would come out otherwise: what is on disk is then made again."""
-FACES = {
+CUBE_FACES = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
     "back": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
@@ -52,19 +52,19 @@ FACES = {
 """Right, down and ahead of each view, in the axes of the panorama."""
 HALF_ANGLE = math.radians(47.5)
 """Of a view, so that neighbours share a strip 5 degrees wide."""
-MARGIN = 4
+MARGIN_PX = 4
 """Pixels of the other side that are put beyond each edge, for the interpolation."""
-GATE = Gate(1 << 30)
+CUT_GATE = ByteSemaphore(1 << 30)
 """Bytes of panoramas that are cut at the same time; one always may be."""
-ALIGN = "align them with COLMAP or OpenSfM, whose models have points, and are read"
+ALIGNMENT_HINT = "align them with COLMAP or OpenSfM, whose models have points, and are read"
 """How to get sparse points of panoramas."""
-PIXEL_BYTES = 12
+PANORAMA_PIXEL_BYTES = 12
 """Of a pixel of a panorama that is being cut: its layers, the margins, and one layer as floats."""
 
 
 def panorama(where: str, size: tuple[int, int]) -> Any:
     """The pycolmap camera of a whole panorama of some width and height, or BadInput that names `where` it is from."""
-    return camera_of(where, PANORAMA, size, size)
+    return camera_of(where, PANORAMA_MODEL, size, size)
 
 
 def check_whole(path: Path, size: tuple[int, int]) -> None:
@@ -76,19 +76,19 @@ def check_whole(path: Path, size: tuple[int, int]) -> None:
         )
 
 
-def parts_of(shot: Shot) -> list[Shot]:
+def parts_of(shot: RawImage) -> list[RawImage]:
     """The views that a photograph gives, with its path: itself, or the six of a panorama."""
     if not is_panorama(shot.camera):
         return [shot]
     camera, found = _camera(shot.camera.width), []
-    for name, axes in zip(_named(shot.name), FACES.values(), strict=True):
+    for name, axes in zip(_named(shot.name), CUBE_FACES.values(), strict=True):
         pose = shot.pose.copy()
         pose[:3] = np.array(axes, np.float64) @ shot.pose[:3]
         found.append(replace(shot, name=name, pose=pose, camera=camera))
     return found
 
 
-def view_names(shots: Sequence[Shot]) -> list[str]:
+def view_names(shots: Sequence[RawImage]) -> list[str]:
     """Names of the views that photographs give."""
     return [name for shot in shots for name in (_named(shot.name) if is_panorama(shot.camera) else [shot.name])]
 
@@ -108,19 +108,19 @@ def points_remedy(path: Path, names: Iterable[str]) -> str:
         names: Of the views that its photographs give.
     """
     if has_panoramas(names):
-        return f"its photographs are panoramas, whose points surfkit does not find: {ALIGN}"
+        return f"its photographs are panoramas, whose points surfkit does not find: {ALIGNMENT_HINT}"
     return f"`surfkit prepare points {shlex.quote(str(path))}` makes a data set with sparse points"
 
 
-def view_sizes(data: Data, shot: Shot, size: tuple[int, int]) -> list[tuple[int, int]]:
+def view_sizes(data: Data, shot: RawImage, size: tuple[int, int]) -> list[tuple[int, int]]:
     """Width and height of each view that a photograph gives, which has a width and height itself."""
     if not is_panorama(shot.camera):
         return [data.size(*size)]
     side = _side(size[0])
-    return [data.size(side, side)] * len(FACES)
+    return [data.size(side, side)] * len(CUBE_FACES)
 
 
-def size_to_read(data: Data, shot: Shot, size: tuple[int, int]) -> tuple[int, int]:
+def size_to_read(data: Data, shot: RawImage, size: tuple[int, int]) -> tuple[int, int]:
     """Width and height at which a photograph is decoded that has a width and height itself.
 
     A panorama is reduced as much as its views are.
@@ -128,10 +128,12 @@ def size_to_read(data: Data, shot: Shot, size: tuple[int, int]) -> tuple[int, in
     if not is_panorama(shot.camera):
         return data.size(*size)
     width = round(size[0] * view_sizes(data, shot, size)[0][0] / _side(size[0]))
-    return max(width, 4 * MARGIN), max(round(width / 2), 2 * MARGIN)
+    return max(width, 4 * MARGIN_PX), max(round(width / 2), 2 * MARGIN_PX)
 
 
-def cut(shot: Shot, picture: Picture, side: int, root: Path, keep: Path | None = None) -> list[tuple[Shot, Picture]]:
+def cut(
+    shot: RawImage, picture: DistortedPhoto, side: int, root: Path, keep: Path | None = None
+) -> list[tuple[RawImage, DistortedPhoto]]:
     """The six views of a panorama, from the cache of the data set or made now.
 
     Args:
@@ -146,13 +148,13 @@ def cut(shot: Shot, picture: Picture, side: int, root: Path, keep: Path | None =
     """
     mask = picture.mask
     paths = [picture.path] + ([mask.path] if mask else [])
-    made_of = f"{RECIPE} {shot.camera.width} {picture.size} {side} {picture.white} {picture.pixels}"
+    made_of = f"{CACHE_VERSION} {shot.camera.width} {picture.size} {side} {picture.white} {picture.pixels}"
     made_of += " alpha" if mask and mask.alpha else ""
-    key, folder = digest(root, made_of, paths), keep or place(root, FOLDER)
-    files = {face: folder / f"{picture.path.stem}-{key}-{face}.png" for face in FACES}
+    key, folder = digest(root, made_of, paths), keep or place(root, PANORAMAS_FOLDER)
+    files = {face: folder / f"{picture.path.stem}-{key}-{face}.png" for face in CUBE_FACES}
     masks = {face: path.with_name(f"{path.stem}-mask.png") for face, path in files.items()} if mask else {}
     if lacking := [face for face, path in files.items() if not path.exists()]:
-        with GATE.taking(PIXEL_BYTES * picture.size[0] * picture.size[1]):
+        with CUT_GATE.taking(PANORAMA_PIXEL_BYTES * picture.size[0] * picture.size[1]):
             layers, kept = _with_margins(read_layers(picture, picture.size)), None
             if mask is not None:
                 whole = read_mask(mask.path, picture.size, mask.alpha)
@@ -165,12 +167,17 @@ def cut(shot: Shot, picture: Picture, side: int, root: Path, keep: Path | None =
                     save_mask(masks[face], grid_sample(kept[None].float(), grid, "nearest", align_corners=False)[0, 0])
                 save_picture(files[face], resampled(layers, grid))  # last: with it, the mask is there too
     return [
-        (view, replace(part, path=files[face], mask=Mask(masks[face], is_part=True) if mask else None, pixels=PLAIN))
-        for face, (view, part) in zip(FACES, views_of(shot, picture, side), strict=True)
+        (
+            view,
+            replace(
+                part, path=files[face], mask=Mask(masks[face], is_part=True) if mask else None, pixels=DEFAULT_PIXELS
+            ),
+        )
+        for face, (view, part) in zip(CUBE_FACES, views_of(shot, picture, side), strict=True)
     ]
 
 
-def views_of(shot: Shot, picture: Picture, side: int) -> list[tuple[Shot, Picture]]:
+def views_of(shot: RawImage, picture: DistortedPhoto, side: int) -> list[tuple[RawImage, DistortedPhoto]]:
     """What `cut` gives, without the pixels: the paths are those of the panorama."""
     return [(part, replace(picture, camera=part.camera, size=(side, side))) for part in parts_of(shot)]
 
@@ -185,7 +192,7 @@ def cut_tracks(tracks: Tracks) -> Tracks:
             continue
         rays = _rays(pixels / (camera.width, camera.height))
         view = _camera(camera.width)
-        for part, axes in zip(_named(name), FACES.values(), strict=True):
+        for part, axes in zip(_named(name), CUBE_FACES.values(), strict=True):
             local = rays @ np.array(axes, np.float64).T
             with np.errstate(divide="ignore", invalid="ignore"):
                 spots = local[:, :2] / local[:, 2:] * view.focal_length + view.width / 2
@@ -197,7 +204,7 @@ def cut_tracks(tracks: Tracks) -> Tracks:
 def _named(name: str) -> list[str]:
     """What the views of a panorama are called."""
     stem = name.removesuffix(Path(name).suffix)
-    return [f"{stem}-{face}.png" for face in FACES]
+    return [f"{stem}-{face}.png" for face in CUBE_FACES]
 
 
 def _side(width: int) -> int:
@@ -219,23 +226,23 @@ def _rays(shares: np.ndarray) -> np.ndarray:
     return np.stack([across * np.sin(longitude), np.sin(latitude), across * np.cos(longitude)], 1)
 
 
-@lru_cache(maxsize=len(FACES))
+@lru_cache(maxsize=len(CUBE_FACES))
 def _grid(face: str, camera_width: int, side: int, size: tuple[int, int]) -> Tensor:
     """(1, side, side, 2): where the pixels of a view lie in a panorama of a width and height, with margins, -1 to 1."""
     camera = _camera(camera_width)
     across = ((np.arange(side) + 0.5) / side - 0.5) * camera.width / camera.focal_length
     local = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1)
-    x, y, z = np.moveaxis(local @ np.array(FACES[face], np.float64), -1, 0)
+    x, y, z = np.moveaxis(local @ np.array(CUBE_FACES[face], np.float64), -1, 0)
     width, height = size
-    u = (np.arctan2(x, z) / (2 * math.pi) + 0.5) * width + MARGIN
-    v = (np.arctan2(y, np.hypot(x, z)) / math.pi + 0.5) * height + MARGIN
-    grid = np.stack([u / (width + 2 * MARGIN), v / (height + 2 * MARGIN)], -1) * 2 - 1
+    u = (np.arctan2(x, z) / (2 * math.pi) + 0.5) * width + MARGIN_PX
+    v = (np.arctan2(y, np.hypot(x, z)) / math.pi + 0.5) * height + MARGIN_PX
+    grid = np.stack([u / (width + 2 * MARGIN_PX), v / (height + 2 * MARGIN_PX)], -1) * 2 - 1
     return torch.from_numpy(grid.astype(np.float32))[None]
 
 
 def _with_margins(pixels: Tensor) -> Tensor:
     """A (C, H, W) panorama, with what lies across each edge beyond it; a pole is crossed half a turn away."""
     half = pixels.shape[2] // 2
-    above, below = (part.flip(1).roll(half, 2) for part in (pixels[:, :MARGIN], pixels[:, -MARGIN:]))
+    above, below = (part.flip(1).roll(half, 2) for part in (pixels[:, :MARGIN_PX], pixels[:, -MARGIN_PX:]))
     tall = torch.cat([above, pixels, below], 1)
-    return torch.cat([tall[:, :, -MARGIN:], tall, tall[:, :, :MARGIN]], 2)
+    return torch.cat([tall[:, :, -MARGIN_PX:], tall, tall[:, :, :MARGIN_PX]], 2)

@@ -16,14 +16,14 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, one_file, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.transforms import points
 from surfkit.scene.crs import code_in, from_wkt, in_plan, metres_of
 
-FOLDERS = ("", "params", "1_initial/params")
+PARAMETER_FOLDERS = ("", "params", "1_initial/params")
 """Where the files may lie."""
 CAMERAS, EXTERNAL, OFFSET, CRS = (
     "_calibrated_camera_parameters.txt",
@@ -32,8 +32,8 @@ CAMERAS, EXTERNAL, OFFSET, CRS = (
     "_wkt.prj",
 )
 """Ends of the names of the files, behind that of the project."""
-FIELD = re.compile(r"(.+?) \[(\d)x(\d)\]")
-FIELDS = {
+MATRIX_PATTERN = re.compile(r"(.+?) \[(\d)x(\d)\]")
+MATRIX_SHAPES = {
     "camera matrix K": (3, 3),
     "radial distortion": (3, 1),
     "tangential distortion": (2, 1),
@@ -41,7 +41,7 @@ FIELDS = {
     "camera rotation R": (3, 3),
 }
 """What a photograph may have in the file of cameras."""
-APART = 1e-3
+MAX_OFFSET_DIFFERENCE = 1e-3
 """Most that two photographs may tell different offsets."""
 
 
@@ -52,21 +52,21 @@ class Pix4D(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         path = one_file(data.path, _files(data.path), f"file *{CAMERAS}; copy 1_initial/params of the project there")
         project = path.name.removesuffix(CAMERAS)
         cameras = _cameras(path)
         offset = _offset(path, project, cameras)
-        found, shots, lenses = photographs(data, [camera.name for camera in cameras]), [], Lenses(path)
+        found, shots, lenses = photographs(data, [camera.name for camera in cameras]), [], LensTable(path)
         for camera in cameras:
             if camera.name in found:
                 with leaving_out():
                     lens = lenses.camera(f"{path}: {camera.name}", camera.lens(path))
                     pose = pose_at(f"{path}: {camera.name}", camera.turn, camera.centre + offset)
-                    shots.append(Shot(camera.name, pose, lens, found[camera.name]))
+                    shots.append(RawImage(camera.name, pose, lens, found[camera.name]))
         lenses.tell()
         crs, metres = _crs(path.with_name(f"{project}{CRS}"))
-        return Capture(
+        return RawDataset(
             shots, *points(data.path, {}), metres=metres, crs=crs, shift=tuple(offset) if any(offset) else None
         )
 
@@ -96,7 +96,7 @@ class _Camera:
 
 def _files(root: Path) -> list[Path]:
     """The files of cameras, in the first folder that has some."""
-    for folder in FOLDERS:
+    for folder in PARAMETER_FOLDERS:
         if found := sorted(path for path in (root / folder).glob(f"*{CAMERAS}") if path.is_file()):
             return found
     return []
@@ -108,18 +108,19 @@ def _cameras(path: Path) -> list[_Camera]:
         raise BadInput(f"{path}: does not begin with 'fileName imageWidth imageHeight'; export the parameters again")
     at, fields = 1, []
     while at < len(lines) and not lines[at].startswith("camera model"):
-        found = FIELD.fullmatch(lines[at])
-        if found is None or FIELDS.get(found[1]) != (int(found[2]), int(found[3])):
+        found = MATRIX_PATTERN.fullmatch(lines[at])
+        if found is None or MATRIX_SHAPES.get(found[1]) != (int(found[2]), int(found[3])):
             raise BadInput(
-                f"{path}: {lines[at][:60]!r} is none of {', '.join(FIELDS)}: only perspective cameras are read; for "
+                f"{path}: {lines[at][:60]!r} is none of {', '.join(MATRIX_SHAPES)}: only perspective cameras are "
+                f"read; for "
                 "others, use undistorted photographs"
             )
         fields.append(found[1])
         at += 1
-    if lacking := [name for name in FIELDS if name not in fields and "distortion" not in name]:
+    if lacking := [name for name in MATRIX_SHAPES if name not in fields and "distortion" not in name]:
         raise BadInput(f"{path}: its list of contents lacks {', '.join(lacking)}; export the parameters again")
     body = lines[at + 1 :]
-    rows = [FIELDS[name] if FIELDS[name][1] > 1 else (1, FIELDS[name][0]) for name in fields]
+    rows = [MATRIX_SHAPES[name] if MATRIX_SHAPES[name][1] > 1 else (1, MATRIX_SHAPES[name][0]) for name in fields]
     each = 1 + sum(height for height, _ in rows)
     if not body or len(body) % each:
         raise BadInput(f"{path}: {len(body)} lines of cameras, of which each takes {each}: cut off; export it again")
@@ -160,7 +161,7 @@ def _offset(path: Path, project: str, cameras: list[_Camera]) -> np.ndarray:
         offsets = [placed[camera.name] - camera.centre for camera in cameras if camera.name in placed]
         if offsets:
             middle = np.median(offsets, axis=0)
-            if np.abs(offsets - middle).max() > APART:
+            if np.abs(offsets - middle).max() > MAX_OFFSET_DIFFERENCE:
                 raise BadInput(f"{full}: its positions are not those of {path.name} and one offset; export both again")
             return np.round(middle, 3)
     emit(Warned(f"{path}: no {own.name} beside it: coordinates are those of the file, which may lack an offset"))

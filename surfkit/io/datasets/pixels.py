@@ -12,10 +12,10 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.scene.photos import open_header, open_picture
 from surfkit.scene.pixels import (
-    PLAIN,
-    TOP,
+    DEFAULT_PIXELS,
+    MAX_UINT16,
     Alpha,
-    Kind,
+    PixelHeader,
     Pixels,
     is_opacity,
     kind_of,
@@ -24,21 +24,21 @@ from surfkit.scene.pixels import (
     white_level_of,
 )
 
-THREADS = 4
-OPTIONS = ("--alpha", "--white")
+READER_THREADS = 4
+ALPHA_OPTIONS = ("--alpha", "--white")
 """What users choose by what becomes of transparent pixels."""
-WAYS = (
+ALPHA_REMEDIES = (
     ("--alpha", "--alpha mask ignores them"),
     ("--alpha", "--alpha ignore takes their colours as stored"),
     ("--white", "--white blends them over white"),
 )
 """What to say of each, with the option that it is."""
-LOOKED_AT = 16
+MAX_EXAMINED_PHOTOS = 16
 """Photographs with an opacity of which all pixels are looked at, to say how much is transparent."""
 
 
 @dataclass(frozen=True)
-class Decided:
+class PixelInterpretation:
     """What the values of photographs mean.
 
     Attributes:
@@ -51,8 +51,8 @@ class Decided:
 
 
 def decide(
-    files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = False, options: Sequence[str] = OPTIONS
-) -> Decided:
+    files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = False, options: Sequence[str] = ALPHA_OPTIONS
+) -> PixelInterpretation:
     """What the values of the photographs of a data set mean. Files that cannot be read are told of where they are used.
 
     White of those of 16 bits is one for all, so that exposures stay comparable: the largest value of the fewest bits
@@ -62,42 +62,44 @@ def decide(
         files: All photographs of the data set by name, not a part of them.
         alpha: What becomes of transparent pixels; by default they are blended, where the band is an opacity.
         white: Whether the user has them blended over white.
-        options: Which of `OPTIONS` the command has, to be named where they may help.
+        options: Which of `ALPHA_OPTIONS` the command has, to be named where they may help.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(READER_THREADS) as pool:
         kinds = dict(zip(files, pool.map(_kind, files.values()), strict=True))
         levels, said = _levels(files, {name: kind for name, kind in kinds.items() if kind.wide}, pool)
         modes, more = _alphas(files, kinds, alpha, white, options, pool)
-    pixels = {name: Pixels(levels.get(name, 0), modes.get(name, PLAIN.alpha)) for name in files}
-    return Decided(pixels, [*said, *more])
+    pixels = {name: Pixels(levels.get(name, 0), modes.get(name, DEFAULT_PIXELS.alpha)) for name in files}
+    return PixelInterpretation(pixels, [*said, *more])
 
 
-def _kind(path: Path) -> Kind:
+def _kind(path: Path) -> PixelHeader:
     try:
         return open_header(path, kind_of)
     except BadInput:
-        return Kind()
+        return PixelHeader()
 
 
 def _levels(
-    files: Mapping[str, Path], wide: Mapping[str, Kind], pool: ThreadPoolExecutor
+    files: Mapping[str, Path], wide: Mapping[str, PixelHeader], pool: ThreadPoolExecutor
 ) -> tuple[dict[str, int], list[str]]:
     """The value that is white by name, where it is not the largest of 16 bits; and what to say."""
     tagged = {name: kind.white_level for name, kind in wide.items() if kind.white_level}
     others = [name for name in wide if name not in tagged]
-    largest = max((wide[name].largest for name in others if wide[name].largest < TOP), default=0)
+    largest = max((wide[name].largest for name in others if wide[name].largest < MAX_UINT16), default=0)
     for value in _largest([files[name] for name in others], pool):
         largest = max(largest, value)
         if white_level_of(largest) == 0:
             break
     level = white_level_of(largest) if others else 0
     said = []
-    if level and level < TOP:
+    if level and level < MAX_UINT16:
         what = f"{_photographs(len(others))} of 16 bits a value, {few(others)}, hold no value of more than"
-        said.append(f"{what} {level.bit_length()} bits: {level:,} is taken for white in all of them, not {TOP:,}")
+        said.append(
+            f"{what} {level.bit_length()} bits: {level:,} is taken for white in all of them, not {MAX_UINT16:,}"
+        )
     elif level:
         said.append(f"{_photographs(len(others))} have values of more than 16 bits: {level:,} is taken for white")
-    if short := {name: value for name, value in tagged.items() if value != TOP}:
+    if short := {name: value for name, value in tagged.items() if value != MAX_UINT16}:
         named = sorted(set(short.values()))
         values = f"{named[0]:,}" if len(named) == 1 else f"{named[0]:,} to {named[-1]:,}"
         said.append(f"white is {values} by a tag in {_photographs(len(short))} of 16 bits a value, {few(list(short))}")
@@ -113,13 +115,13 @@ def _largest(paths: Sequence[Path], pool: ThreadPoolExecutor) -> Iterator[int]:
         except BadInput:
             return 0
 
-    for at in range(0, len(paths), THREADS):
-        yield from pool.map(look, paths[at : at + THREADS])
+    for at in range(0, len(paths), READER_THREADS):
+        yield from pool.map(look, paths[at : at + READER_THREADS])
 
 
 def _alphas(
     files: Mapping[str, Path],
-    kinds: Mapping[str, Kind],
+    kinds: Mapping[str, PixelHeader],
     alpha: Alpha | None,
     white: bool,
     options: Sequence[str],
@@ -146,14 +148,14 @@ def _alphas(
         )
     rest = [name for name in having if name not in bands]
     if not white and (line := _transparent(files, rest, len(files), pool)):
-        ways = [way for option, way in WAYS if option in options]
+        ways = [way for option, way in ALPHA_REMEDIES if option in options]
         said.append("; ".join([line, *([", ".join(ways)] if ways else [])]))
     return {name: "ignore" if name in set(bands) else "blend" for name in having}, said
 
 
 def _transparent(files: Mapping[str, Path], having: Sequence[str], count: int, pool: ThreadPoolExecutor) -> str | None:
     """A line where photographs with an opacity have transparent pixels."""
-    chosen = having[:: max(1, -(-len(having) // LOOKED_AT))]
+    chosen = having[:: max(1, -(-len(having) // MAX_EXAMINED_PHOTOS))]
     looks = zip(chosen, pool.map(lambda name: _opacity(files[name]), chosen), strict=True)
     shares = {name: look.transparent for name, look in looks if look is not None and look.transparent > 0}
     if not shares:
@@ -168,16 +170,16 @@ def _transparent(files: Mapping[str, Path], having: Sequence[str], count: int, p
 
 
 @dataclass(frozen=True)
-class _Look:
+class _AlphaStats:
     """Whether a band is an opacity by its values, and the share of its pixels that are transparent."""
 
     is_opacity: bool
     transparent: float
 
 
-def _opacity(path: Path) -> _Look | None:
-    def look(values: np.ndarray) -> _Look:
-        return _Look(is_opacity(values), float(1 - values.mean(dtype=np.float64) / 255))
+def _opacity(path: Path) -> _AlphaStats | None:
+    def look(values: np.ndarray) -> _AlphaStats:
+        return _AlphaStats(is_opacity(values), float(1 - values.mean(dtype=np.float64) / 255))
 
     try:
         return open_picture(path, lambda image: look(opacity_of(image)))

@@ -10,15 +10,15 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.scene.crs import known_axes
 
-FILE = "georeference.json"
-CODE = re.compile(r"EPSG:\d{4,6}", re.IGNORECASE)
+GEOREFERENCE_FILE = "georeference.json"
+EPSG_PATTERN = re.compile(r"EPSG:\d{4,6}", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Placed:
+class Georeference:
     """Coordinates on the map are those of the cameras plus the offset.
 
     Attributes:
@@ -40,7 +40,9 @@ class Placed:
             or not (self.metres_per_unit is None or 0 < self.metres_per_unit < np.inf)
         ):
             raise BadInput("crs must name a system, offset and metres_per_unit must be finite numbers")
-        if self.vertical_crs is not None and not (CODE.fullmatch(self.crs) and CODE.fullmatch(self.vertical_crs)):
+        if self.vertical_crs is not None and not (
+            EPSG_PATTERN.fullmatch(self.crs) and EPSG_PATTERN.fullmatch(self.vertical_crs)
+        ):
             raise BadInput(
                 f"vertical_crs is {self.vertical_crs!r} and crs {self.crs!r}; with a vertical_crs, both must be codes "
                 "such as EPSG:5773 and EPSG:32633"
@@ -52,20 +54,20 @@ class Placed:
         return self.crs if self.vertical_crs is None else f"{self.crs}+{self.vertical_crs.partition(':')[2]}"
 
 
-def read_placed(*folders: Path) -> Placed | None:
+def read_placed(*folders: Path) -> Georeference | None:
     """Where the cameras lie by the file in one of some folders; None if no file says so.
 
     Raises:
         BadInput: A file is damaged, or two of them differ.
     """
-    paths = [path for path in dict.fromkeys(folder / FILE for folder in folders) if path.is_file()]
-    found = [read_json(path, Placed) for path in paths]
+    paths = [path for path in dict.fromkeys(folder / GEOREFERENCE_FILE for folder in folders) if path.is_file()]
+    found = [read_json(path, Georeference) for path in paths]
     if other := next((path for path, placed in zip(paths, found, strict=True) if placed != found[0]), None):
         raise BadInput(f"{paths[0]} and {other} differ; delete the one that is wrong")
     return found[0] if found else None
 
 
-def on_the_map(capture: Capture, placed: Placed) -> Capture:
+def on_the_map(capture: RawDataset, placed: Georeference) -> RawDataset:
     """A capture in the coordinates of the map."""
     offset, metres = np.array(placed.offset), placed.metres_per_unit
     if metres is None and (axes := known_axes(placed.system)) is not None:

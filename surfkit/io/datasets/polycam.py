@@ -18,9 +18,9 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, photographs, pose_at
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
@@ -28,16 +28,16 @@ from surfkit.io.datasets.depth_layouts import MILLIMETRE
 from surfkit.io.datasets.transforms import points
 
 KEYFRAMES = "keyframes"
-SETS = ("corrected_", "")
+FOLDER_PREFIXES = ("corrected_", "")
 """What the names of folders begin with: those of optimised poses and undistorted photographs, and the others."""
-ENDS = (".jpg", ".jpeg", ".png")
-POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
-LENS = ("fx", "fy", "cx", "cy", "width", "height")
-REACH_MM = 5000
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+POSE_KEYS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
+CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
+MAX_DEPTH_MM = 5000
 """Of the LiDAR of telephones; Polycam says that depths beyond are guesses."""
-FLIP = np.diag([1.0, -1.0, -1.0])
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
-Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+WORLD_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """From a world with y up to one with z up."""
 
 
@@ -46,11 +46,11 @@ class Polycam(Reader):
     """Polycam's raw data: keyframes/corrected_images and corrected_cameras, or images and cameras; z up, in metres."""
 
     def recognises(self, root: Path) -> bool:
-        return any((root / KEYFRAMES / f"{kind}cameras").is_dir() for kind in SETS)
+        return any((root / KEYFRAMES / f"{kind}cameras").is_dir() for kind in FOLDER_PREFIXES)
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         folder = data.path / KEYFRAMES
-        kind = next((kind for kind in SETS if _is_filled(folder, kind)), None)
+        kind = next((kind for kind in FOLDER_PREFIXES if _is_filled(folder, kind)), None)
         if kind is None:
             raise BadInput(f"{folder}: no photographs with cameras in images/ and cameras/; export the raw data again")
         if not kind:
@@ -62,16 +62,16 @@ class Polycam(Reader):
             )
         files = sorted((folder / f"{kind}cameras").glob("*.json"))
         named = {_photo(folder / f"{kind}images", path.stem): path for path in files}
-        found, shots, lenses = photographs(data, list(named)), [], Lenses(folder)
+        found, shots, lenses = photographs(data, list(named)), [], LensTable(folder)
         for name, path in named.items():
             if name in found:
                 with leaving_out():
                     values = read_json(path, dict[str, Any])
                     shots.append(
-                        Shot(name, _pose(path, values), lenses.camera(str(path), _lens(path, values)), found[name])
+                        RawImage(name, _pose(path, values), lenses.camera(str(path), _lens(path, values)), found[name])
                     )
         lenses.tell()
-        return Capture(shots, *points(data.path, {}), metres=1.0)
+        return RawDataset(shots, *points(data.path, {}), metres=1.0)
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PolycamDepth(DepthFile):
     def stored(self) -> np.ndarray:
         """See `DepthFile.stored`."""
         values = super().stored()
-        return np.where(values > REACH_MM, 0, values)
+        return np.where(values > MAX_DEPTH_MM, 0, values)
 
     def read_confidence(self) -> np.ndarray | None:
         """(h, w) float32: 0, 1/2 or 1, from keyframes/confidence; None where it is not there."""
@@ -109,25 +109,27 @@ class PolycamDepths(DepthLayout):
 
 
 def _is_filled(folder: Path, kind: str) -> bool:
-    """Whether there are cameras and photographs of a kind of `SETS`."""
-    photos = (path for path in (folder / f"{kind}images").glob("*") if path.suffix in ENDS)
+    """Whether there are cameras and photographs of a kind of `FOLDER_PREFIXES`."""
+    photos = (path for path in (folder / f"{kind}images").glob("*") if path.suffix in PHOTO_SUFFIXES)
     return any((folder / f"{kind}cameras").glob("*.json")) and any(photos)
 
 
 def _photo(folder: Path, stem: str) -> str:
     """The photograph of a camera, below the data set."""
-    end = next((end for end in ENDS if (folder / f"{stem}{end}").is_file()), ENDS[0])
+    end = next((end for end in PHOTO_SUFFIXES if (folder / f"{stem}{end}").is_file()), PHOTO_SUFFIXES[0])
     return f"{KEYFRAMES}/{folder.name}/{stem}{end}"
 
 
 def _pose(path: Path, values: Mapping[str, Any]) -> np.ndarray:
     """(4, 4) world_to_camera, the world with z up."""
-    matrix = _numbers(path, values, POSE).reshape(3, 4)
-    return pose_at(f"{path}: t_00 to t_23", FLIP @ matrix[:, :3].T @ Z_UP.T, Z_UP @ matrix[:, 3])
+    matrix = _numbers(path, values, POSE_KEYS).reshape(3, 4)
+    return pose_at(
+        f"{path}: t_00 to t_23", OPENGL_TO_OPENCV @ matrix[:, :3].T @ WORLD_TO_Z_UP.T, WORLD_TO_Z_UP @ matrix[:, 3]
+    )
 
 
 def _lens(path: Path, values: Mapping[str, Any]) -> Brown:
-    fx, fy, cx, cy, width, height = _numbers(path, values, LENS).tolist()
+    fx, fy, cx, cy, width, height = _numbers(path, values, CAMERA_KEYS).tolist()
     return Brown((round(width), round(height)), (fx, fy), (cx, cy))
 
 

@@ -17,14 +17,14 @@ from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit, reading_again
 from surfkit.core.registry import components, find, name_of
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture, Shot
-from surfkit.io.datasets.colmap import COLMAP, MODELS
+from surfkit.io.datasets.capture import RawDataset, RawImage
+from surfkit.io.datasets.colmap import COLMAP, MODEL_FOLDERS
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.masks import check_mask, find_masks, with_opacity
 from surfkit.io.datasets.panoramas import (
-    FACES,
-    FOLDER,
+    CUBE_FACES,
+    PANORAMAS_FOLDER,
     check_whole,
     cut,
     cut_tracks,
@@ -35,12 +35,12 @@ from surfkit.io.datasets.panoramas import (
     view_sizes,
     views_of,
 )
-from surfkit.io.datasets.pixels import Decided, decide
-from surfkit.io.datasets.placed import FILE, Placed, on_the_map, read_placed
-from surfkit.io.datasets.record3d import PACKED
+from surfkit.io.datasets.pixels import PixelInterpretation, decide
+from surfkit.io.datasets.placed import GEOREFERENCE_FILE, Georeference, on_the_map, read_placed
+from surfkit.io.datasets.record3d import PACKED_SUFFIX
 from surfkit.io.datasets.reduced import reduced
 from surfkit.io.datasets.undistort import (
-    Picture,
+    DistortedPhoto,
     check_camera,
     is_panorama,
     is_pinhole,
@@ -52,10 +52,10 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.copies import place
 from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
-from surfkit.scene.names import PICTURES, VIDEOS, is_video
-from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.names import PICTURE_SUFFIXES, VIDEO_SUFFIXES, is_video
+from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.photos import is_turned, photo_size, refuse_large
-from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
+from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 
 NO_NUMBER = 2**32 - 1
 """What pycolmap calls cameras of programs that do not number them."""
@@ -82,7 +82,7 @@ def read(data: Data) -> Scene:
     return build_scene(data, capture)
 
 
-def read_capture(data: Data, reader: Reader) -> Capture:
+def read_capture(data: Data, reader: Reader) -> RawDataset:
     """What a reader finds in a data set, and in the one that is for tests."""
     if data.model is not None and reader.model_folder(data) is None:
         raise BadInput(f"--model {data.model}: a data set of layout {name_of(reader)} has no such model; leave it out")
@@ -90,22 +90,24 @@ def read_capture(data: Data, reader: Reader) -> Capture:
     return capture if data.test_data is None else _with_tests(capture, reader, data)
 
 
-def _read_placed(data: Data, reader: Reader) -> Capture:
+def _read_placed(data: Data, reader: Reader) -> RawDataset:
     """What a reader finds in a data set, on the map if a file says on which."""
     capture, placed = reader.read(data), _placed(data, reader)
     if placed is not None and capture.crs is not None:
-        raise BadInput(f"{data.path / FILE}: the cameras name a system themselves, {capture.crs}; delete this file")
+        raise BadInput(
+            f"{data.path / GEOREFERENCE_FILE}: the cameras name a system themselves, {capture.crs}; delete this file"
+        )
     return capture if placed is None else on_the_map(capture, placed)
 
 
-def _placed(data: Data, reader: Reader) -> Placed | None:
+def _placed(data: Data, reader: Reader) -> Georeference | None:
     """What the data set says of its place on the map; a model in a folder of its own has that file there."""
     return None if reader.model_folder(data) is not None else read_placed(data.path)
 
 
 def build_scene(
     data: Data,
-    capture: Capture,
+    capture: RawDataset,
     keep: Path | None = None,
     only: Collection[str] | None = None,
     pixels: bool = True,
@@ -147,7 +149,7 @@ def build_scene(
     return scene
 
 
-def _cutting(data: Data, whole: Sequence[Shot], frame: Frame) -> str:
+def _cutting(data: Data, whole: Sequence[RawImage], frame: Frame) -> str:
     """What to say of panoramas."""
     query = DepthQuery(data.path, [shot.name for shot in whole], model_folder(data), frame.metres)
     maps = 0
@@ -155,10 +157,10 @@ def _cutting(data: Data, whole: Sequence[Shot], frame: Frame) -> str:
         maps = len(find_maps(query, data.depth_layout))
     unused = f"; depth maps of {maps} of them are not cut with them, and not used" if maps else ""
     count = "1 panorama is" if len(whole) == 1 else f"{len(whole)} panoramas are"
-    return f"{count} cut into {len(FACES)} views each, which lie in {place(data.path, FOLDER)}{unused}"
+    return f"{count} cut into {len(CUBE_FACES)} views each, which lie in {place(data.path, PANORAMAS_FOLDER)}{unused}"
 
 
-def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
+def _with_tests(capture: RawDataset, reader: Reader, data: Data) -> RawDataset:
     """The photographs of both data sets, those of the test data held out, under the name of its folder."""
     root = data.test_data
     if root is None or not root.is_dir():
@@ -168,7 +170,7 @@ def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
     return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
 
 
-def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
+def _frame(data: Data, capture: RawDataset, poses: np.ndarray) -> Frame:
     """The frame of the training cameras, with what the data set or the user knows of its place and unit."""
     frame = Frame.around(poses, capture.xyz)
     shift = capture.shift or frame.shift
@@ -196,7 +198,7 @@ def reader_of(data: Data) -> Reader:
     root = data.path
     if is_video(root):
         raise BadInput(f"{root}: a video; {_finds_cameras(root)}")
-    if root.suffix.lower() == PACKED and root.is_file():
+    if root.suffix.lower() == PACKED_SUFFIX and root.is_file():
         command = f"unzip {shlex.quote(str(root))} -d {shlex.quote(str(root.with_suffix('')))}"
         raise BadInput(f"{root}: a packed scan of Record3D; `{command}` unpacks it; give the folder that this makes")
     if not root.is_dir():
@@ -215,7 +217,7 @@ def reader_of(data: Data) -> Reader:
         raise BadInput(f"{root}: no data set itself, but the folder {inner[0].name!r} in it is one; give {inner[0]}")
     if not first and (photos := bare_photographs(root)):
         raise BadInput(
-            f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
+            f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODEL_FOLDERS)}; "
             f"{_finds_cameras(photos)}"
         )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
@@ -237,7 +239,9 @@ def bare_photographs(root: Path) -> Path | None:
     if not root.is_dir() or _fitting(root):
         return None
     for folder in (root / "images", root):
-        if folder.is_dir() and any(path.suffix.lower() in PICTURES | VIDEOS for path in folder.rglob("*")):
+        if folder.is_dir() and any(
+            path.suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES for path in folder.rglob("*")
+        ):
             return folder
     return None
 
@@ -263,7 +267,7 @@ def observations(data: Data, scene: Scene) -> Observations:
     for view in (*scene.train, *scene.held_out):
         if view.name in tracks.seen:
             rows, pixels = tracks.seen[view.name]
-            seen[view.name] = Seen(rows, _shares(pixels, tracks.cameras[view.name], view.camera))
+            seen[view.name] = Observations2D(rows, _shares(pixels, tracks.cameras[view.name], view.camera))
     xyz = tracks.xyz if placed is None else tracks.xyz + placed.offset
     return Observations(scene.frame.to_local(xyz), tracks.error_px, seen)
 
@@ -276,15 +280,16 @@ def model_folder(data: Data) -> Path:
 def _wanted() -> str:
     others = ", ".join(name for name in components(Reader) if name != "colmap")
     return (
-        f"a data set is a folder with images/ and a COLMAP model in {', '.join(MODELS[:-1])} or {MODELS[-1]}, "
+        f"a data set is a folder with images/ and a COLMAP model in {', '.join(MODEL_FOLDERS[:-1])} or "
+        f"{MODEL_FOLDERS[-1]}, "
         f"or of another layout: {others or 'none is registered'}"
     )
 
 
 def _views(
     data: Data,
-    shots: Sequence[Shot],
-    decided: Decided,
+    shots: Sequence[RawImage],
+    decided: PixelInterpretation,
     masks: Mapping[str, Mask],
     frame: Frame,
     keep: Path | None,
@@ -292,7 +297,9 @@ def _views(
 ) -> list[tuple[str, View]]:
     """The photographs at the size to use them at, undistorted, with the name of the one that each view is of."""
 
-    def straight(shot: Shot, size: tuple[int, int], picture: Picture) -> list[tuple[Shot, Picture]]:
+    def straight(
+        shot: RawImage, size: tuple[int, int], picture: DistortedPhoto
+    ) -> list[tuple[RawImage, DistortedPhoto]]:
         if is_panorama(shot.camera):
             side = view_sizes(data, shot, size)[0][0]
             return cut(shot, picture, side, data.path, keep) if pixels else views_of(shot, picture, side)
@@ -311,7 +318,7 @@ def _views(
             if shot.name in masks:
                 check_mask(masks[shot.name].path, size)
         given = [
-            Picture(
+            DistortedPhoto(
                 shot.path,
                 masks.get(shot.name),
                 shot.camera,
@@ -338,7 +345,7 @@ def _views(
     ]
 
 
-def check_size(shot: Shot, size: tuple[int, int]) -> None:
+def check_size(shot: RawImage, size: tuple[int, int]) -> None:
     """BadInput unless the photograph is the camera's picture at some size, within a pixel; a panorama must be whole."""
     if is_panorama(shot.camera):
         check_whole(shot.path, size)
@@ -358,7 +365,7 @@ def check_size(shot: Shot, size: tuple[int, int]) -> None:
     )
 
 
-def _view(shot: Shot, picture: Picture, bent: Lens | None, frame: Frame) -> View:
+def _view(shot: RawImage, picture: DistortedPhoto, bent: Lens | None, frame: Frame) -> View:
     lens = picture.camera
     full = Camera(
         world_to_camera=frame.local_pose(shot.pose),
@@ -380,10 +387,10 @@ def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
     return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
 
 
-def _cloud(path: Path, capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
+def _cloud(path: Path, capture: RawDataset, poses: np.ndarray, frame: Frame) -> SparsePoints:
     if len(capture.xyz):
         xyz = frame.to_local(capture.xyz).astype(np.float32)
-        return Cloud(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
+        return SparsePoints(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
     emit(
         Warned(
             f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
@@ -396,4 +403,4 @@ def _cloud(path: Path, capture: Capture, poses: np.ndarray, frame: Frame) -> Clo
     corners = np.concatenate([centres, centres + local[:, 2, :3]])  # one extent ahead, along the optical axes
     draw = np.random.default_rng(0)
     xyz = draw.uniform(corners.min(0), corners.max(0), (RANDOM_POINTS, 3)).astype(np.float32)
-    return Cloud(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8), drawn=True)
+    return SparsePoints(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8), drawn=True)

@@ -18,20 +18,20 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, one_file, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.transforms import points
 from surfkit.scene.photos import photo_size
 
 FILM_MM = 36.0
-COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-NEWER = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
+CSV_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+NEWER_COLUMNS = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 """What RealityScan calls columns of RealityCapture."""
-FLAT = 0.02
+MIN_HORIZONTAL_RATIO = 0.02
 """Of the range of heights: a smaller range of x and y is probably one of degrees."""
-FLIP = np.diag([1.0, -1.0, -1.0])
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
 
 
@@ -42,19 +42,19 @@ class RealityCapture(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_files(root))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         path = one_file(data.path, _files(data.path), "CSV file of 'Internal/External camera parameters'; export it")
         rows = _rows(path)
         found = photographs(data, [row["name"] for row in rows])
-        shots: list[Shot] = []
-        lenses = Lenses(path)
+        shots: list[RawImage] = []
+        lenses = LensTable(path)
         for row in rows:
             if row["name"] in found:
                 with leaving_out():
                     shots.append(_shot(path, row, found[row["name"]], lenses))
         lenses.tell()
         _tell_degrees(path, shots)
-        return Capture(shots, *points(data.path, {}))
+        return RawDataset(shots, *points(data.path, {}))
 
 
 def _files(root: Path) -> list[Path]:
@@ -73,14 +73,14 @@ def _is_headed(path: Path) -> bool:
 
 def _columns(line: str) -> list[str]:
     words = [word.strip() for word in line.strip().removeprefix("#").split(",")]
-    return [NEWER.get(word, word) for word in words]
+    return [NEWER_COLUMNS.get(word, word) for word in words]
 
 
 def _rows(path: Path) -> list[Mapping[str, str]]:
     """The photographs: text by column."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     columns = _columns(lines[0])
-    if lacking := [name for name in COLUMNS if name not in columns]:
+    if lacking := [name for name in CSV_COLUMNS if name not in columns]:
         raise BadInput(
             f"{path}: it lacks {', '.join(lacking)}; export it as 'Internal/External camera parameters' again"
         )
@@ -99,10 +99,10 @@ def _rows(path: Path) -> list[Mapping[str, str]]:
     return rows
 
 
-def _shot(path: Path, row: Mapping[str, str], photo: Path, lenses: Lenses) -> Shot:
+def _shot(path: Path, row: Mapping[str, str], photo: Path, lenses: LensTable) -> RawImage:
     where = f"{path}: {row['name']}"
-    given = numbers(where, [row[name] for name in COLUMNS[1:]], len(COLUMNS) - 1).tolist()
-    value = dict(zip(COLUMNS[1:], given, strict=True))
+    given = numbers(where, [row[name] for name in CSV_COLUMNS[1:]], len(CSV_COLUMNS) - 1).tolist()
+    value = dict(zip(CSV_COLUMNS[1:], given, strict=True))
     width, height = photo_size(photo)
     longer = max(width, height)
     focal, centre = value["f"] / FILM_MM * longer, (value["px"] * longer + width / 2, value["py"] * longer + height / 2)
@@ -110,16 +110,16 @@ def _shot(path: Path, row: Mapping[str, str], photo: Path, lenses: Lenses) -> Sh
     lens = lenses.camera(where, Brown((width, height), (focal, focal), centre, radial, (value["t2"], value["t1"])))
     axes = _turn(2, -value["heading"]) @ _turn(0, value["pitch"]) @ _turn(1, value["roll"])  # camera to world
     place = np.array([value["x"], value["y"], value["alt"]])
-    return Shot(row["name"], pose_at(where, FLIP @ axes.T, place), lens, photo)
+    return RawImage(row["name"], pose_at(where, OPENGL_TO_OPENCV @ axes.T, place), lens, photo)
 
 
-def _tell_degrees(path: Path, shots: Sequence[Shot]) -> None:
+def _tell_degrees(path: Path, shots: Sequence[RawImage]) -> None:
     """A warning if positions look like longitudes and latitudes: the file does not say what they are."""
     if len(shots) < 2:
         return
     centres = np.stack([-shot.pose[:3, :3].T @ shot.pose[:3, 3] for shot in shots])
     east, north, up = np.ptp(centres, axis=0)
-    if (np.abs(centres[:, :2]) <= (180, 90)).all() and max(east, north) < FLAT * up:
+    if (np.abs(centres[:, :2]) <= (180, 90)).all() and max(east, north) < MIN_HORIZONTAL_RATIO * up:
         emit(
             Warned(
                 f"{path}: x and y differ by {max(east, north):.2g} and heights by {up:.2g}: if these are degrees, "

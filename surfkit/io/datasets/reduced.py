@@ -8,15 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import Shot
+from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.scene.names import find_files
 from surfkit.scene.photos import photo_size
 
-FOLDER = "images"
+IMAGES_FOLDER = "images"
 
 
-def reduced(data: Data, shots: Sequence[Shot]) -> tuple[Data, Sequence[Shot]]:
+def reduced(data: Data, shots: Sequence[RawImage]) -> tuple[Data, Sequence[RawImage]]:
     """The photographs in images_N/ and a data set of scale 1, where --scale N asks for these; all as it was if not.
 
     A note says which are used, or why they are not: one that is missing, or of another size than images/ divided by N.
@@ -28,8 +28,8 @@ def reduced(data: Data, shots: Sequence[Shot]) -> tuple[Data, Sequence[Shot]]:
             text = f"the photographs in {data.images} are divided by {data.scale:g} once more; leave out --scale to use"
             emit(Warned(f"{text} them as they are"))
         return data, shots
-    whole = data.path / FOLDER
-    folder = next((path for path in sorted(data.path.glob(f"{FOLDER}_*")) if _factor(path) == data.scale), None)
+    whole = data.path / IMAGES_FOLDER
+    folder = next((path for path in sorted(data.path.glob(f"{IMAGES_FOLDER}_*")) if _factor(path) == data.scale), None)
     if folder is None or not folder.is_dir() or not all(shot.path.is_relative_to(whole) for shot in shots):
         return data, shots
     names = [shot.path.relative_to(whole).as_posix() for shot in shots]
@@ -58,7 +58,7 @@ def _factor(folder: Path) -> float | None:
         return None
 
 
-def _other_size(scale: float, shots: Sequence[Shot], small: Sequence[Shot]) -> str | None:
+def _other_size(scale: float, shots: Sequence[RawImage], small: Sequence[RawImage]) -> str | None:
     """What is wrong with the first copy that is more than a pixel off the size of its photograph divided by scale."""
     with ThreadPoolExecutor(4) as pool:
         sizes = pool.map(photo_size, [shot.path for shot in shots])

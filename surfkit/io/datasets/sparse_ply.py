@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.splats.ply import read_vertices
 
-COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +27,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not {"x", "y", "z"} <= columns.keys():
         raise BadInput(f"{path}: no file of points: it lacks x, y or z")
     xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
-    names = next((names for names in COLORS if set(names) <= columns.keys()), None)
+    names = next((names for names in COLOR_NAMES if set(names) <= columns.keys()), None)
     rgb = np.full((len(xyz), 3), 128, np.uint8)
     if names is not None:
         values = np.stack([columns[name] for name in names], 1)

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 
 
 class Split(Component):
     """A rule of which photographs of a data set are held out."""
 
     @abstractmethod
-    def held_out(self, capture: Capture) -> Collection[str]:
+    def held_out(self, capture: RawDataset) -> Collection[str]:
         """Names of the photographs to hold out, not all of them.
 
         Args:
@@ -31,7 +31,7 @@ class Split(Component):
 class GauUScene(Split):
     """GauU-Scene: of n photographs, every k-th in the order of COLMAP's image numbers, k = n // ceil(n / 10)."""
 
-    def held_out(self, capture: Capture) -> Collection[str]:
+    def held_out(self, capture: RawDataset) -> Collection[str]:
         """See `Split.held_out`."""
         if not capture.numbered:
             raise BadInput("is for COLMAP data sets; leave it out")

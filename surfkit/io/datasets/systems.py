@@ -11,13 +11,15 @@ from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.scene.crs import BESIDE, POLAR, code_in, exact, from_wkt, zone_of
+from surfkit.scene.crs import MAX_UTM_LATITUDE, MAX_UTM_OFFSET_DEGREES, code_in, exact, from_wkt, zone_of
 from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
-CODE = re.compile(r"(?:.*\()?(?:urn:ogc:def:crs:)?EPSG\s*:{0,2}\s*(\d+(?:\+\d+)?)\)?", re.IGNORECASE | re.DOTALL)
+EPSG_NAME_PATTERN = re.compile(
+    r"(?:.*\()?(?:urn:ogc:def:crs:)?EPSG\s*:{0,2}\s*(\d+(?:\+\d+)?)\)?", re.IGNORECASE | re.DOTALL
+)
 """A code alone, as "EPSG:32633" or "epsg::4326", or after a name, as "WGS 84 (EPSG::4326)"."""
-UTM = re.compile(r"WGS[ _]?84\s*/?\s*UTM(?:\s+zone)?\s*(\d+)\s*([A-Z])?", re.IGNORECASE)
+UTM_NAME_PATTERN = re.compile(r"WGS[ _]?84\s*/?\s*UTM(?:\s+zone)?\s*(\d+)\s*([A-Z])?", re.IGNORECASE)
 """OpenDroneMap's "WGS84 UTM 33N", and the name of EPSG, "WGS 84 / UTM zone 33N"."""
 WGS84_NAMES = frozenset({"WGS84", "WGS 84", "WGS_84"})
 WKT = re.compile(r"[A-Z_]+\s*\[", re.IGNORECASE)
@@ -52,7 +54,7 @@ class System:
         if zone := zone_of(self.crs):
             found = np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
             away = np.abs(found[:, 1] - (6 * zone[0] - 183))
-            found[~((np.abs(found[:, 0]) <= POLAR) & (away < BESIDE)), :2] = np.nan
+            found[~((np.abs(found[:, 0]) <= MAX_UTM_LATITUDE) & (away < MAX_UTM_OFFSET_DEGREES)), :2] = np.nan
             return found
         given = CRS(self.crs)
         known = exact(given.to_2d(), WGS84_DEGREES)
@@ -70,7 +72,10 @@ def names_a_system(text: str) -> bool:
     """Whether a line looks like the name of a coordinate reference system, known or not."""
     text = text.strip().strip("'\"")
     return bool(
-        CODE.fullmatch(text) or UTM.fullmatch(text) or text.upper() in WGS84_NAMES or WKT.match(text)
+        EPSG_NAME_PATTERN.fullmatch(text)
+        or UTM_NAME_PATTERN.fullmatch(text)
+        or text.upper() in WGS84_NAMES
+        or WKT.match(text)
     ) or text.startswith("+")
 
 
@@ -81,7 +86,7 @@ def system_of(text: str) -> System:
         BadInput: It is none.
     """
     text = text.strip().strip("'\"").strip()
-    if found := UTM.fullmatch(text):
+    if found := UTM_NAME_PATTERN.fullmatch(text):
         return _utm(text, int(found[1]), (found[2] or "").upper())
     if text.startswith("+") and all(map(PROJ.fullmatch, text.split())):
         words = {word.removesuffix("=True") for word in text.split()}
@@ -90,7 +95,7 @@ def system_of(text: str) -> System:
         if number := next((int(word.removeprefix("+zone=")) for word in words if word.startswith("+zone=")), None):
             return _utm(text, number, "S" if "+south" in words else "N")
     named = code_in(from_wkt("well-known text", text)) if WKT.match(text) else None
-    if found := CODE.fullmatch(named or text):
+    if found := EPSG_NAME_PATTERN.fullmatch(named or text):
         text = f"EPSG:{found[1]}"
     return _by_pyproj(text)
 
@@ -99,7 +104,7 @@ def covers(crs: str, latitude: float, longitude: float) -> bool:
     """Whether a system is meant for a place; True where it does not say what it is meant for."""
     if zone := zone_of(crs):
         away = abs((longitude - (6 * zone[0] - 183) + 180) % 360 - 180)
-        return away < 6 and abs(latitude) <= POLAR and (latitude < 1 if zone[1] else latitude > -1)
+        return away < 6 and abs(latitude) <= MAX_UTM_LATITUDE and (latitude < 1 if zone[1] else latitude > -1)
     try:
         area = CRS(crs).area_of_use
     except ProjError:

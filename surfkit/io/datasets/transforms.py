@@ -15,27 +15,27 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture, Shot, camera_of, shorten
+from surfkit.io.datasets.capture import RawDataset, RawImage, camera_of, shorten
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_cloud import sample_depth_maps
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_layouts import MatrixCityDepths
 from surfkit.io.datasets.panoramas import panorama
 from surfkit.io.datasets.sparse_ply import read_points
-from surfkit.io.datasets.undistort import PANORAMA
+from surfkit.io.datasets.undistort import PANORAMA_MODEL
 from surfkit.scene.names import name_below, named_file
 from surfkit.scene.photos import photo_size
 
-ENDS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """What may be missing at the end of a file_path."""
-NUMBERED = ("", "rgb", "images", "input")
+NUMBERED_PHOTO_FOLDERS = ("", "rgb", "images", "input")
 """Where MatrixCity's numbered photographs may lie, below their poses; or in a folder of the block's own name."""
-POINTS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
+POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Files of sparse points that a data set need not name."""
-OFF_CENTRE, ALIKE = 1.25, 1.1
+MAX_CENTRE_RATIO, MAX_AXIS_RATIO = 1.25, 1.1
 """A principal point that is so much farther from the corner than the middle, or nearer, along both axes alike, is one
 of a photograph of another size."""
-MOST = 1e30
+MAX_FILE_NUMBER = 1e30
 """Numbers beyond it are a mistake."""
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
@@ -47,11 +47,11 @@ class Nerfstudio(Reader):
     def recognises(self, root: Path) -> bool:
         return (root / "transforms.json").is_file()
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         path = data.path / "transforms.json"
         contents, shots = frames(path, data)
         held = _listed(path, contents, data, {shot.name for shot in shots})
-        return Capture(shots, *points(data.path, contents), frozenset(held) if held else None)
+        return RawDataset(shots, *points(data.path, contents), frozenset(held) if held else None)
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Blender(Reader):
     def recognises(self, root: Path) -> bool:
         return (root / "transforms_train.json").is_file()
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         contents, train = frames(data.path / "transforms_train.json", data)
-        held: list[Shot] = []
+        held: list[RawImage] = []
         for part in ("test", "val"):
             if not held and (data.path / f"transforms_{part}.json").is_file():
                 held = frames(data.path / f"transforms_{part}.json", data)[1]
@@ -78,7 +78,7 @@ class MatrixCity(Reader):
     def recognises(self, root: Path) -> bool:
         return bool(_blocks(root / "train"))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         read = [frames(path, data) for path in _blocks(data.path / "train")]
         if not read:
             raise BadInput(f"{data.path}: no transforms.json in train/ or in a folder below it")
@@ -91,8 +91,8 @@ class MatrixCity(Reader):
         return replace(_split(train, held, sparse), metres=metres)
 
 
-def _split(train: list[Shot], held: list[Shot], sparse: tuple[np.ndarray, np.ndarray]) -> Capture:
-    return Capture([*train, *held], *sparse, frozenset(shot.name for shot in held) if held else None)
+def _split(train: list[RawImage], held: list[RawImage], sparse: tuple[np.ndarray, np.ndarray]) -> RawDataset:
+    return RawDataset([*train, *held], *sparse, frozenset(shot.name for shot in held) if held else None)
 
 
 def _blocks(folder: Path) -> list[Path]:
@@ -102,7 +102,7 @@ def _blocks(folder: Path) -> list[Path]:
     return whole or found
 
 
-def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
+def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[RawImage]]:
     """What a file of transforms says, and its photographs.
 
     Raises:
@@ -122,7 +122,7 @@ def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
             camera = _camera(where, {**contents, **frame}, photo)
             camera = cameras.setdefault(str(camera), camera)  # one for all frames that share it
             mask = named_file(path.parent, str(frame["mask_path"])) if frame.get("mask_path") else None
-            shots.append(Shot(name_below(data.path, photo), pose, camera, photo, mask))
+            shots.append(RawImage(name_below(data.path, photo), pose, camera, photo, mask))
             read.append((frame, shots[-1]))
     guessed = [shot.name for frame, shot in read if _size_is_guessed({**contents, **frame})]
     if guessed:
@@ -143,7 +143,7 @@ def _size_is_guessed(values: Mapping[str, Any]) -> bool:
 
 def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """The sparse points of a data set, in the frame of its poses; none if it has none."""
-    named = contents.get("ply_file_path") or next((name for name in POINTS if (root / name).is_file()), None)
+    named = contents.get("ply_file_path") or next((name for name in POINT_FILES if (root / name).is_file()), None)
     with leaving_out():
         if named:
             return read_points(named_file(root, str(named)))
@@ -191,11 +191,11 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
     places: Sequence[str] = [said, said.replace("\\", "/").rpartition("/")[2]] if said else []
     if isinstance(index, int):
         numbered = f"{index:04d}.png"
-        places = [*places, *(f"{below}/{numbered}".lstrip("/") for below in (*NUMBERED, folder.name))]
+        places = [*places, *(f"{below}/{numbered}".lstrip("/") for below in (*NUMBERED_PHOTO_FOLDERS, folder.name))]
     bases = [folder, *([data.path / data.images] if data.images else [])]
     for place in places:
         for base in reversed(bases):  # --images first
-            for end in ENDS:
+            for end in TRIED_SUFFIXES:
                 path = named_file(base, f"{place}{end}")
                 if path.is_file():
                     return path
@@ -204,7 +204,7 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
 
 def _number(where: str, values: Mapping[str, Any], name: str, default: float | None = None) -> float:
     value = values.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MOST:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MAX_FILE_NUMBER:
         raise BadInput(f"{where}: {name} is {shorten(value)}, not a number")
     return float(value)
 
@@ -212,7 +212,7 @@ def _number(where: str, values: Mapping[str, Any], name: str, default: float | N
 def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     """The pycolmap camera that intrinsics describe."""
     width, height = _size(where, values, photo)
-    if values.get("camera_model") == PANORAMA:
+    if values.get("camera_model") == PANORAMA_MODEL:
         return panorama(where, (width, height))
     fx, fy = _focal(where, values, width, height)
     centre = [_number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)]
@@ -221,7 +221,9 @@ def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     if values.get("is_fisheye") is True or model == "OPENCV_FISHEYE":
         model, extra = "OPENCV_FISHEYE", [k["k1"], k["k2"], k["k3"], k["k4"]]
     elif model not in PERSPECTIVE:
-        raise BadInput(f"{where}: camera_model {model}; known: {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, {PANORAMA}")
+        raise BadInput(
+            f"{where}: camera_model {model}; known: {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, {PANORAMA_MODEL}"
+        )
     elif k["k4"]:
         raise BadInput(f"{where}: k4 of a perspective camera means different things to different programs; drop it")
     elif not any(k.values()):
@@ -247,7 +249,11 @@ def _size(where: str, values: Mapping[str, Any], photo: Path) -> tuple[int, int]
     if "cx" in values and "cy" in values:
         centre = _number(where, values, "cx"), _number(where, values, "cy")
         times = [2 * at / whole for at, whole in zip(centre, size, strict=True)]
-        alike = min(times) > 0 and max(times) < ALIKE * min(times) and not 1 / OFF_CENTRE < times[0] < OFF_CENTRE
+        alike = (
+            min(times) > 0
+            and max(times) < MAX_AXIS_RATIO * min(times)
+            and not 1 / MAX_CENTRE_RATIO < times[0] < MAX_CENTRE_RATIO
+        )
         if alike or not all(0 <= each <= 2 for each in times):
             raise BadInput(
                 f"{where}: the principal point {centre[0]:g}, {centre[1]:g} is that of a photograph of about "

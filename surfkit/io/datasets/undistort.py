@@ -19,23 +19,23 @@ from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.masks import read_mask
 from surfkit.scene.copies import digest, place
 from surfkit.scene.photos import read_photo
-from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Lens, Mask
 
-FOLDER = "undistorted"
-RECIPE = "1"
+UNDISTORTED_FOLDER = "undistorted"
+CACHE_VERSION = "1"
 """Changes when the same photograph would come out otherwise: what is on disk is then made again."""
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
-SHORTEST_PX = 1e-6
+MIN_FOCAL_PX = 1e-6
 """Shorter focal lengths are a mistake."""
-PANORAMA = "EQUIRECTANGULAR"
+PANORAMA_MODEL = "EQUIRECTANGULAR"
 """COLMAP's model of a panorama."""
 POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are pinholes when all their coefficients are 0."""
 
 
 @dataclass(frozen=True)
-class Picture:
+class DistortedPhoto:
     """A photograph and the camera that took it.
 
     Attributes:
@@ -52,7 +52,7 @@ class Picture:
     camera: Any
     size: tuple[int, int]
     white: bool = False
-    pixels: Pixels = PLAIN
+    pixels: Pixels = DEFAULT_PIXELS
 
 
 def is_pinhole(camera: Any) -> bool:
@@ -64,7 +64,7 @@ def is_pinhole(camera: Any) -> bool:
 
 def is_panorama(camera: Any) -> bool:
     """Whether a camera is that of an equirectangular panorama."""
-    return bool(camera.model.name == PANORAMA)
+    return bool(camera.model.name == PANORAMA_MODEL)
 
 
 def check_camera(camera: Any, name: str) -> None:
@@ -73,11 +73,11 @@ def check_camera(camera: Any, name: str) -> None:
     values = [*camera.params, camera.width, camera.height]
     if not (np.isfinite(values).all() and camera.width > 0 and camera.height > 0):
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
-    if not all(camera.params[i] > SHORTEST_PX for i in camera.focal_length_idxs()):
+    if not all(camera.params[i] > MIN_FOCAL_PX for i in camera.focal_length_idxs()):
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
 
 
-def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture:
+def undistort(picture: DistortedPhoto, root: Path, keep: Path | None = None) -> DistortedPhoto:
     """The picture of a pinhole camera, from the cache of the data set or made now.
 
     Args:
@@ -99,10 +99,10 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
         save_picture(path, values * inside)  # last: with it, the mask is there too
     size = camera.width, camera.height
     kept = None if mask is None else Mask(mask)
-    return replace(picture, path=path, mask=kept, camera=camera, size=size, pixels=PLAIN)
+    return replace(picture, path=path, mask=kept, camera=camera, size=size, pixels=DEFAULT_PIXELS)
 
 
-def read_layers(picture: Picture, size: tuple[int, int]) -> Tensor:
+def read_layers(picture: DistortedPhoto, size: tuple[int, int]) -> Tensor:
     """(3, H, W) uint8 of a picture at a width and height; (4, H, W) where its own opacity is its mask.
 
     The colours of transparent pixels are none then, and must not spread: they are 0, and the fourth layer is 1 where
@@ -122,7 +122,7 @@ def resampled(layers: Tensor, grid: Tensor) -> Tensor:
     return values[:3] / values[3:].clamp(min=0.1) if len(values) > 3 else values
 
 
-def pinhole_of(picture: Picture) -> Picture:
+def pinhole_of(picture: DistortedPhoto) -> DistortedPhoto:
     """The picture that `undistort` gives, without its pixels: its paths are those of the distorted photograph."""
     camera, _, _ = warp(lens_of(picture.camera, picture.size))
     return replace(picture, camera=camera, size=(camera.width, camera.height))
@@ -162,7 +162,7 @@ def warp(lens: Lens) -> tuple[Any, Tensor, Tensor]:
     return camera, torch.from_numpy(grid).reshape(1, *shape, 2), torch.from_numpy(inside).reshape(shape)
 
 
-def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
+def _keep(picture: DistortedPhoto, grid: Tensor, inside: Tensor) -> Tensor:
     """(h, w) bool: pixels that the photograph shows and its mask keeps."""
     if picture.mask is None:
         return inside
@@ -170,22 +170,22 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
     return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
 
 
-def _is_own_mask(picture: Picture) -> bool:
+def _is_own_mask(picture: DistortedPhoto) -> bool:
     """Whether the opacity of a photograph is its mask."""
     return picture.mask is not None and picture.mask.path == picture.path
 
 
-def _cached(picture: Picture, lens: Lens, root: Path) -> str:
+def _cached(picture: DistortedPhoto, lens: Lens, root: Path) -> str:
     """The name of the undistorted picture, which depends on all that it was made from; as earlier versions spelt it."""
     paths = [picture.path] if picture.mask is None else [picture.path, picture.mask.path]
-    values = "" if picture.pixels == PLAIN else f" {picture.pixels}"
+    values = "" if picture.pixels == DEFAULT_PIXELS else f" {picture.pixels}"
     values += " alpha" if picture.mask is not None and picture.mask.alpha and not _is_own_mask(picture) else ""
-    return f"{picture.path.stem}-{digest(root, f'{RECIPE} _{lens} {picture.white}{values}', paths)}.png"
+    return f"{picture.path.stem}-{digest(root, f'{CACHE_VERSION} _{lens} {picture.white}{values}', paths)}.png"
 
 
 def cache_folder(root: Path) -> Path:
     """Where the undistorted photographs of a data set are kept."""
-    return place(root, FOLDER)
+    return place(root, UNDISTORTED_FOLDER)
 
 
 def save_picture(path: Path, values: Tensor) -> None:

@@ -20,22 +20,22 @@ import numpy as np
 
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.brown import Brown, Lenses
+from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import leave_out, numbers, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import Capture, Shot
+from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.realitycapture import FILM_MM
 from surfkit.io.datasets.transforms import points
-from surfkit.scene.names import PICTURES
+from surfkit.scene.names import PICTURE_SUFFIXES
 from surfkit.scene.photos import photo_size
 
 SPACE = "http://www.capturingreality.com/ns/xcr/"
 """What the namespace begins with; its version follows."""
-HEAD = 4096
+SNIFFED_BYTES = 4096
 """Bytes of a file that are looked at to recognise it."""
 TERMS = {"perspective": (0, 0), "brown3": (3, 0), "brown4": (4, 0), "brown3t2": (3, 2), "brown4t2": (4, 2)}
 """Distortion models, and how many radial and tangential coefficients they use."""
-COEFFICIENTS = ("DistortionCoeficients", "DistortionCoefficients")
+DISTORTION_KEYS = ("DistortionCoeficients", "DistortionCoefficients")
 """As RealityCapture spells it, and as it is spelt."""
 
 
@@ -49,7 +49,7 @@ class XmpSidecars(Reader):
     def recognises(self, root: Path) -> bool:
         return any(_is_sidecar(path) for path in _sidecars(root, root / "images"))
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         own = data.path / (data.images or "images")
         folder = own if own.is_dir() else data.path
         files = [path for path in _sidecars(data.path, folder) if _is_sidecar(path)]
@@ -63,14 +63,14 @@ class XmpSidecars(Reader):
         without = [path.name for path in values.keys() - set(posed)]
         leave_out(folder, sorted(without), len(values), "have no pose in their XMP")
         names = _names(folder, posed)
-        found, shots, lenses = photographs(data, list(names.values())), [], Lenses(folder)
+        found, shots, lenses = photographs(data, list(names.values())), [], LensTable(folder)
         for path, name in names.items():
             if name in found:
                 with leaving_out():
                     camera = lenses.camera(str(path), _lens(path, values[path], found[name]))
-                    shots.append(Shot(name, _pose(path, values[path]), camera, found[name]))
+                    shots.append(RawImage(name, _pose(path, values[path]), camera, found[name]))
         lenses.tell()
-        return Capture(shots, *points(data.path, {}))
+        return RawDataset(shots, *points(data.path, {}))
 
 
 def _sidecars(root: Path, folder: Path) -> list[Path]:
@@ -81,7 +81,7 @@ def _sidecars(root: Path, folder: Path) -> list[Path]:
 def _is_sidecar(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return SPACE.encode() in file.read(HEAD)
+            return SPACE.encode() in file.read(SNIFFED_BYTES)
     except OSError:
         return False
 
@@ -106,7 +106,7 @@ def _names(folder: Path, files: list[Path]) -> dict[Path, str]:
     """The photograph of each file, of the same name but its ending; that name alone where there is none or several."""
     photos: dict[Path, list[Path]] = {}
     for photo in sorted(folder.rglob("*")):
-        if photo.suffix.lower() in PICTURES:
+        if photo.suffix.lower() in PICTURE_SUFFIXES:
             photos.setdefault(photo.with_suffix(""), []).append(photo)
     names = {}
     for path in files:
@@ -130,8 +130,8 @@ def _lens(path: Path, values: Mapping[str, str], photo: Path) -> Brown:
         return float(numbers(f"{path}: xcr:{name}", [text], 1)[0])
 
     model = values.get("DistortionModel", "perspective")
-    text = next((values[name] for name in COEFFICIENTS if name in values), "")
-    given = numbers(f"{path}: xcr:{COEFFICIENTS[0]}", text, len(text.split())).tolist()
+    text = next((values[name] for name in DISTORTION_KEYS if name in values), "")
+    given = numbers(f"{path}: xcr:{DISTORTION_KEYS[0]}", text, len(text.split())).tolist()
     if len(given) > 6 or (any(given) and model not in TERMS):
         raise BadInput(
             f"{path}: distortion model {model!r} with {len(given)} coefficients; known: {', '.join(TERMS)}, of six "

@@ -11,7 +11,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     """What this folder offers."""
     from surfkit.io.splats.compressed_ply import CompressedPLY
     from surfkit.io.splats.gltf import GLTF
-    from surfkit.io.splats.page import Page
+    from surfkit.io.splats.page import HtmlPageFormat
     from surfkit.io.splats.ply import PLY
     from surfkit.io.splats.sog import SOG
     from surfkit.io.splats.splat import Splat
@@ -21,7 +21,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     return {
         "compressed-ply": CompressedPLY,
         "gltf": GLTF,
-        "page": Page,
+        "page": HtmlPageFormat,
         "ply": PLY,
         "sog": SOG,
         "splat": Splat,

@@ -17,10 +17,10 @@ Axes = Literal[
 ]  # fmt: skip
 """In the order of the numbers that SPZ gives them, from 1."""
 AxesOrAuto = Literal["auto", Axes]
-NAMES: tuple[Axes, ...] = get_args(Axes)
+AXES_NAMES: tuple[Axes, ...] = get_args(Axes)
 PLY_AXES: Axes = "rdf"
-WORDS = {"r": "right", "l": "left", "u": "up", "d": "down", "f": "forward", "b": "back"}
-DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "u": (0, 1, 0), "d": (0, -1, 0), "f": (0, 0, -1), "b": (0, 0, 1)}
+DIRECTION_WORDS = {"r": "right", "l": "left", "u": "up", "d": "down", "f": "forward", "b": "back"}
+AXIS_DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "u": (0, 1, 0), "d": (0, -1, 0), "f": (0, 0, -1), "b": (0, 0, 1)}
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ def turn_between(axes: Axes, to: Axes = PLY_AXES) -> np.ndarray:
 
 def in_words(axes: Axes) -> str:
     """Such as "right-down-forward"."""
-    return "-".join(WORDS[letter] for letter in axes)
+    return "-".join(DIRECTION_WORDS[letter] for letter in axes)
 
 
 def _directions(axes: Axes) -> np.ndarray:
     """(3, 3): each column is where an axis points."""
-    return np.array([DIRECTIONS[letter] for letter in axes], np.float64).T
+    return np.array([AXIS_DIRECTIONS[letter] for letter in axes], np.float64).T

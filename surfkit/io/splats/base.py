@@ -11,7 +11,7 @@ from surfkit.core.registry import Component, name_of
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
-HEAD = 4096
+SNIFFED_BYTES = 4096
 """Bytes at the beginning of a file by which formats know it."""
 
 

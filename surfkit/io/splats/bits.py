@@ -8,13 +8,13 @@ from surfkit.scene.morton import morton_order
 
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0."""
-QUARTER = 0.25 / 255
+MIN_OPACITY = 0.25 / 255
 """Least opacity that a byte of 0 stands for: it becomes the same byte again, and has a logit."""
-ENDS = 0.1
+TAIL_SHARE = 0.1
 """Share of the splats at either end of an axis that say nothing about the extent of the others."""
-OUTLYING = 4.0
+OUTLYING_EXTENTS = 4.0
 """Extents from the middle beyond which splats are far from the others."""
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Components beside the largest."""
 
 
@@ -25,7 +25,7 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 
 def logits(opacities: np.ndarray) -> np.ndarray:
     """Float32 logits of opacities in [0, 1] that were bytes."""
-    inside = opacities.astype(np.float64).clip(QUARTER, 1 - QUARTER)
+    inside = opacities.astype(np.float64).clip(MIN_OPACITY, 1 - MIN_OPACITY)
     return np.log(inside / (1 - inside)).astype(np.float32)
 
 
@@ -46,13 +46,13 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     largest = np.abs(quats).argmax(1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
-    return largest, np.take_along_axis(quats, OTHERS[largest], 1) * (sign * np.sqrt(2))
+    return largest, np.take_along_axis(quats, OTHER_COMPONENTS[largest], 1) * (sign * np.sqrt(2))
 
 
 def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
     """(N, 4) float32 quaternions that `smallest_three` gives for these."""
     quats = np.empty((len(three), 4), np.float32)
-    np.put_along_axis(quats, OTHERS[largest], (three / np.sqrt(2)).astype(np.float32), 1)
+    np.put_along_axis(quats, OTHER_COMPONENTS[largest], (three / np.sqrt(2)).astype(np.float32), 1)
     rest = np.sqrt((1 - (three.astype(np.float64) ** 2).sum(1) / 2).clip(0))
     np.put_along_axis(quats, largest[:, None], rest[:, None].astype(np.float32), 1)
     return quats
@@ -72,10 +72,10 @@ def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarr
     """
     if len(means) <= group:
         return morton_order(means)
-    low, high = np.quantile(means, (ENDS, 1 - ENDS), axis=0)
+    low, high = np.quantile(means, (TAIL_SHARE, 1 - TAIL_SHARE), axis=0)
     away = np.abs(means - (low + high) / 2).max(1)
     extent = max(float((high - low).max()), away.max() * 2.0**-40, np.finfo(float).tiny)
-    octave = np.ceil(np.log2(np.maximum(away / (OUTLYING * extent), 1))).astype(int)
+    octave = np.ceil(np.log2(np.maximum(away / (OUTLYING_EXTENTS * extent), 1))).astype(int)
     core = np.flatnonzero(octave == 0)
     if len(core) < len(means) and (left := len(core) % group):
         filling = core[np.argsort(shown[core], kind="stable")[:left]]

@@ -10,7 +10,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import components, name_of
 from surfkit.io.splats.axes import Axes, AxesOrAuto, FileAxes, in_words, turn_between
-from surfkit.io.splats.base import HEAD, Format
+from surfkit.io.splats.base import SNIFFED_BYTES, Format
 from surfkit.io.splats.table import SplatTable
 from surfkit.io.splats.turn import turned
 
@@ -63,7 +63,7 @@ def format_of(path: Path) -> Format:
             if path.exists() and not path.is_file():  # a pipe would wait for someone to write
                 raise BadInput(f"{path}: neither a file nor a folder; name a file of splats")
             with path.open("rb") as file:
-                head = file.read(HEAD)
+                head = file.read(SNIFFED_BYTES)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     known = [cls() for cls in components(Format).values()]

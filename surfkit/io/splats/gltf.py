@@ -20,22 +20,22 @@ import numpy as np
 import torch
 
 from surfkit.core.version import own_version
-from surfkit.io.glb import BYTE, FLOAT, MAGIC, VERTICES, Blocks, write_glb
+from surfkit.io.glb import FLOAT, GLB_MAGIC, UNSIGNED_BYTE, VERTICES, GlbWriter, write_glb
 from surfkit.io.splats.axes import turn_between
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import SH_C0, to_bytes
-from surfkit.io.splats.gltf_reader import COMPRESSED, LEAST, SPLATS, UPS, harmonics, read_splats
+from surfkit.io.splats.gltf_reader import COMPRESSED, MIN_NORMAL_FLOAT32, SPLATS, UPS, harmonics, read_splats
 from surfkit.io.splats.spz import SPZ, spz_bytes, spz_table
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.io.splats.turn import turned
 from surfkit.scene.rotations import unit
-from surfkit.scene.scene import FAR, Frame
+from surfkit.scene.scene import MAX_EXTENTS_OFFSET, Frame
 
 Compress = Literal["none", "spz"]
 Up = Literal["auto", "y", "-y", "z"]
-LEAST_W = 0.45
+MIN_QUATERNION_W = 0.45
 """Components w that are kept; the largest of the four is at least a half, and little less when it was rounded."""
-MOST_SCALE = 1e38
+MAX_SCALE = 1e38
 """Largest scale that is written: float32 ends there."""
 
 
@@ -71,7 +71,7 @@ class GLTF(Format):
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""
-        return head.startswith(MAGIC)
+        return head.startswith(GLB_MAGIC)
 
     def rounding(self, table: SplatTable) -> str:
         """See `Format.rounding`."""
@@ -98,7 +98,7 @@ def write_splats(path: Path, table: SplatTable, turn: np.ndarray, compress: Comp
         notes: What `asset.extras.surfkit` says besides how to read the splats back.
     """
     table = table.on_cpu()
-    centre = _centre(table, 0.0 if compress == "spz" else FAR)
+    centre = _centre(table, 0.0 if compress == "spz" else MAX_EXTENTS_OFFSET)
     table = replace(table, means=table.means.double() - torch.from_numpy(centre)) if centre.any() else table
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, turn @ centre
@@ -108,7 +108,7 @@ def write_splats(path: Path, table: SplatTable, turn: np.ndarray, compress: Comp
         "scene": 0,
         "scenes": [{"name": "empty"}],
     }
-    blocks = Blocks()
+    blocks = GlbWriter()
     if len(table):
         # CesiumJS asks for a matrix even where it changes nothing; of other identities, the validator warns
         plain = np.array_equal(matrix, np.eye(4)) and compress == "none"
@@ -137,14 +137,17 @@ def _centre(table: SplatTable, far: float) -> np.ndarray:
     return np.where(np.abs(middle) > far * extent, np.round(middle), 0.0)
 
 
-def _plain(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
+def _plain(path: Path, blocks: GlbWriter, table: SplatTable) -> dict[str, Any]:
     """The primitive of splats as they are, float32."""
     count = len(table)
     means = table.means.float()
     low, high = (value.tolist() for value in torch.aminmax(means, dim=0))
     columns: dict[str, tuple[str, Any]] = {
         "ROTATION": ("VEC4", lambda: np.roll(unit(table.quats.numpy()), -1, axis=1)),
-        "SCALE": ("VEC3", lambda: table.ellipsoid_log_scales().double().exp().clamp(LEAST, MOST_SCALE).numpy()),
+        "SCALE": (
+            "VEC3",
+            lambda: table.ellipsoid_log_scales().double().exp().clamp(MIN_NORMAL_FLOAT32, MAX_SCALE).numpy(),
+        ),
         "OPACITY": ("SCALAR", lambda: torch.sigmoid(table.opacity_logits.double()).numpy()),
         "SH_DEGREE_0_COEF_0": ("VEC3", lambda: table.sh0.numpy()),
     }
@@ -153,7 +156,9 @@ def _plain(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
     view = blocks.add(12 * count, lambda: _bytes(means.numpy()), target=VERTICES)
     attributes = {"POSITION": blocks.accessor(view, componentType=FLOAT, count=count, type="VEC3", min=low, max=high)}
     view = blocks.add(4 * count, lambda: _fallback(table), target=VERTICES)
-    attributes["COLOR_0"] = blocks.accessor(view, componentType=BYTE, count=count, type="VEC4", normalized=True)
+    attributes["COLOR_0"] = blocks.accessor(
+        view, componentType=UNSIGNED_BYTE, count=count, type="VEC4", normalized=True
+    )
     for name, (kind, make) in columns.items():
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[kind]
         view = blocks.add(4 * width * count, lambda make=make: _bytes(make()), target=VERTICES)
@@ -162,7 +167,7 @@ def _plain(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
     return {"attributes": attributes, "extensions": {SPLATS: {**about, "projection": "perspective"}}}
 
 
-def _compressed(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
+def _compressed(path: Path, blocks: GlbWriter, table: SplatTable) -> dict[str, Any]:
     """The primitive of splats as SPZ, with the accessors that CesiumJS expects: no values, and no degree 0."""
     quats = torch.from_numpy(sure_rotations(table.quats.numpy()))
     data = spz_bytes(replace(table, quats=quats), 2, path)
@@ -171,7 +176,7 @@ def _compressed(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]
     count = len(table)
     attributes = {
         "POSITION": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC3", min=low, max=high),
-        "COLOR_0": blocks.accessor(None, componentType=BYTE, count=count, type="VEC4", normalized=True),
+        "COLOR_0": blocks.accessor(None, componentType=UNSIGNED_BYTE, count=count, type="VEC4", normalized=True),
         f"{SPLATS}:SCALE": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC3"),
         f"{SPLATS}:ROTATION": blocks.accessor(None, componentType=FLOAT, count=count, type="VEC4"),
     }
@@ -193,7 +198,7 @@ def sure_rotations(quats: np.ndarray) -> np.ndarray:
     w, x, y, z = quats.T
     halves = np.stack([(-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)])  # times i, j and k
     best = halves[np.abs(quats[:, 1:]).argmax(1), :, np.arange(len(quats))]
-    return np.where((stored**2).sum(1, keepdims=True) > 1 - LEAST_W**2, best, quats)
+    return np.where((stored**2).sum(1, keepdims=True) > 1 - MIN_QUATERNION_W**2, best, quats)
 
 
 def _bytes(values: np.ndarray) -> bytes:

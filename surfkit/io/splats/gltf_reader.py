@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.io.glb import UNLIT, Document, read_glb
+from surfkit.io.glb import UNLIT, GltfDocument, read_glb
 from surfkit.io.splats.axes import Axes, FileAxes, turn_between
 from surfkit.io.splats.spz import SPZ_ROUNDING, spz_table
-from surfkit.io.splats.table import COLUMNS, SplatTable
+from surfkit.io.splats.table import SPLAT_COLUMNS, SplatTable
 from surfkit.io.splats.turn import parts_of, turned
 from surfkit.scene.rotations import numpy_rotations
 
@@ -36,13 +36,13 @@ GLTF_AXES: Axes = "luf"
 WRITERS = ("splat-transform ",)
 """How `asset.generator` begins in files of programs that turn PLY files by half a turn about z, to these axes."""
 LUF = turn_between("rub", GLTF_AXES)
-BEST = 1 - 2.0**-24
+MAX_OPACITY = 1 - 2.0**-24
 """Largest float32 below 1: opacities of 1 have no logit."""
-LEAST = float(np.finfo(np.float32).tiny)
-TAKEN = 20
+MIN_NORMAL_FLOAT32 = float(np.finfo(np.float32).tiny)
+MIN_BYTES_PER_SPLAT = 20
 """Bytes in a file that a splat takes at least, uncompressed: more splats than there are bytes for are refused."""
-MOST_NODES = 100_000
-ROUNDING = 1e-5
+MAX_NODES = 100_000
+LOG_SCALE_ROUNDING = 1e-5
 """Of logarithms of float32."""
 
 
@@ -74,12 +74,12 @@ def read_splats(path: Path) -> SplatTable:
     if not notes:
         axes = FileAxes(GLTF_AXES, str(document.entry("asset", "generator")).startswith(WRITERS))
         is_coarse = COMPRESSED in _list(document, document.root, "extensionsUsed")
-        return replace(table.as_surfels_if_thin(*(SPZ_ROUNDING if is_coarse else (ROUNDING,))), axes=axes)
+        return replace(table.as_surfels_if_thin(*(SPZ_ROUNDING if is_coarse else (LOG_SCALE_ROUNDING,))), axes=axes)
     table = replace(table, antialias=notes["antialias"])
     return table.as_surfels() if notes["kind"] == "surfel" else table
 
 
-def _placed(document: Document, table: SplatTable, matrix: np.ndarray) -> SplatTable:
+def _placed(document: GltfDocument, table: SplatTable, matrix: np.ndarray) -> SplatTable:
     try:
         turn, scale, move = parts_of(matrix)
     except BadInput as error:
@@ -87,7 +87,7 @@ def _placed(document: Document, table: SplatTable, matrix: np.ndarray) -> SplatT
     return turned(table, turn, scale, move)
 
 
-def _notes(document: Document) -> dict[str, Any]:
+def _notes(document: GltfDocument) -> dict[str, Any]:
     """What surfkit wrote for itself; nothing in a file of another program."""
     found = document.entry("asset", "extras", "surfkit")
     if not isinstance(found, dict):
@@ -100,7 +100,7 @@ def _notes(document: Document) -> dict[str, Any]:
     return {**found, "offset": offset}
 
 
-def _meshes(document: Document) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
+def _meshes(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
     """World matrix and mesh of each node of the scene that has one; a mesh is read once."""
     scene = document.item("scenes", document.root.get("scene", 0))
     waiting = [(np.eye(4), index) for index in reversed(_list(document, scene, "nodes"))]
@@ -109,7 +109,7 @@ def _meshes(document: Document) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
     while waiting:
         above, index = waiting.pop()
         node = document.item("nodes", index)
-        if index in passed or len(passed) > MOST_NODES:
+        if index in passed or len(passed) > MAX_NODES:
             raise document.fault(f"damaged: nodes[{index}] hangs below itself or below two others")
         passed.add(index)
         matrix = above @ _matrix(document, node, index)
@@ -122,14 +122,14 @@ def _meshes(document: Document) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
             yield matrix, mesh
 
 
-def _list(document: Document, holder: dict[str, Any], key: str) -> list[Any]:
+def _list(document: GltfDocument, holder: dict[str, Any], key: str) -> list[Any]:
     found = holder.get(key, [])
     if not isinstance(found, list):
         raise document.fault(f"damaged: {key} is no list")
     return found
 
 
-def _matrix(document: Document, node: dict[str, Any], index: int) -> np.ndarray:
+def _matrix(document: GltfDocument, node: dict[str, Any], index: int) -> np.ndarray:
     """(4, 4) of a node, from its matrix or from translation, rotation and scale."""
     where = f"nodes[{index}]"
     if "matrix" in node:
@@ -142,7 +142,7 @@ def _matrix(document: Document, node: dict[str, Any], index: int) -> np.ndarray:
     return matrix
 
 
-def _tables(document: Document, mesh: Mapping[str, Any]) -> Iterator[SplatTable]:
+def _tables(document: GltfDocument, mesh: Mapping[str, Any]) -> Iterator[SplatTable]:
     """The splats of each primitive of a mesh that has some, in the axes of its node."""
     for primitive in _list(document, mesh, "primitives"):
         about = primitive.get("extensions", {}) if isinstance(primitive, dict) else None
@@ -162,7 +162,7 @@ def _tables(document: Document, mesh: Mapping[str, Any]) -> Iterator[SplatTable]
         yield (_compressed if inner else _plain)(document, attributes, about)
 
 
-def _compressed(document: Document, attributes: Mapping[str, Any], about: Mapping[str, Any]) -> SplatTable:
+def _compressed(document: GltfDocument, attributes: Mapping[str, Any], about: Mapping[str, Any]) -> SplatTable:
     """Of SPZ data, whose axes are those of the node; those of the draft where the file keeps to it (see gltf.py)."""
     where = about["extensions"][COMPRESSED]
     data, _ = document.view(where.get("bufferView") if isinstance(where, dict) else None)
@@ -173,11 +173,11 @@ def _compressed(document: Document, attributes: Mapping[str, Any], about: Mappin
     return turned(table, LUF) if {"kernel", "colorSpace"} <= set(about) else table
 
 
-def _plain(document: Document, attributes: Mapping[str, Any], about: Mapping[str, Any]) -> SplatTable:
+def _plain(document: GltfDocument, attributes: Mapping[str, Any], about: Mapping[str, Any]) -> SplatTable:
     """Of accessors."""
     means = document.values(attributes.get("POSITION"), "VEC3")
     count = len(means)
-    if count * TAKEN > len(document.block):
+    if count * MIN_BYTES_PER_SPLAT > len(document.block):
         raise document.fault(f"damaged: {count} splats in {len(document.block)} bytes; write or copy it again")
 
     def values(name: str, kind: str) -> np.ndarray:
@@ -189,12 +189,12 @@ def _plain(document: Document, attributes: Mapping[str, Any], about: Mapping[str
     rest = np.zeros((count, (degree + 1) ** 2 - 1, 3), np.float32)
     for name, at in harmonics(degree):
         rest[:, at] = values(name, "VEC3")
-    opacity = values("OPACITY", "SCALAR")[:, 0].astype(np.float64).clip(LEAST, BEST)
+    opacity = values("OPACITY", "SCALAR")[:, 0].astype(np.float64).clip(MIN_NORMAL_FLOAT32, MAX_OPACITY)
     return SplatTable(
         kind="gaussian",
         means=torch.from_numpy(means),
         quats=torch.from_numpy(np.roll(values("ROTATION", "VEC4"), 1, axis=1)),
-        log_scales=torch.from_numpy(np.log(values("SCALE", "VEC3").clip(LEAST))),
+        log_scales=torch.from_numpy(np.log(values("SCALE", "VEC3").clip(MIN_NORMAL_FLOAT32))),
         opacity_logits=torch.from_numpy(np.log(opacity / (1 - opacity)).astype(np.float32)),
         sh0=torch.from_numpy(values("SH_DEGREE_0_COEF_0", "VEC3")),
         sh_rest=torch.from_numpy(rest),
@@ -223,5 +223,5 @@ def _joined(tables: list[SplatTable], degree: int) -> SplatTable:
         for table in tables
     ]
     wide = any(table.means.dtype == torch.float64 for table in padded)
-    columns = {name: torch.cat([getattr(table, name) for table in padded]) for name in COLUMNS}
+    columns = {name: torch.cat([getattr(table, name) for table in padded]) for name in SPLAT_COLUMNS}
     return replace(padded[0], **columns, **({"means": columns["means"].double()} if wide else {}))

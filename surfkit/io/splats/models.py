@@ -16,7 +16,7 @@ from surfkit.io.splats.files import format_of
 from surfkit.io.splats.table import SplatTable
 from surfkit.scene.scene import Frame, Scene, View
 
-MOST_VIEWS = 64
+MAX_SEARCHED_VIEWS = 64
 """Training views that are searched for splats, evenly spaced."""
 
 
@@ -100,7 +100,7 @@ def warn_of_no_fit(path: Path, table: SplatTable, scene: Scene) -> None:
 
 def is_in_view(means: Tensor, views: Sequence[View]) -> bool:
     """Whether the centre of a splat, (N, 3) local units, lies in the picture of one of up to MOST_VIEWS views."""
-    for view in views[:: math.ceil(len(views) / MOST_VIEWS)]:
+    for view in views[:: math.ceil(len(views) / MAX_SEARCHED_VIEWS)]:
         x, y, z = view.camera.project(means).unbind(1)
         inside = (z > 0) & (x >= 0) & (x <= view.camera.width) & (y >= 0) & (y <= view.camera.height)
         if bool(inside.any()):

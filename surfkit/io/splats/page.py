@@ -27,24 +27,24 @@ from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.io.splats.turn import turned
 from surfkit.scene.scene import Frame, View
 
-REACH = 0.9
+EXTENT_SPLAT_SHARE = 0.9
 """Share of the splats within the extent of a page."""
-EXTENT = 64.0
+PAGE_RADIUS_UNITS = 64.0
 """Units of the page: half of what the scene takes. Scales of SPZ, 4.5e-5 to 380, lie well about it."""
-MOST_VIEWS = 64
+MAX_PAGE_VIEWS = 64
 """Places of photographs that the page knows, evenly spaced."""
-LOOKED_AT = 20_000
+MAX_DISTANCE_SPLATS = 20_000
 """Splats by which it is found how far ahead of a camera the scene lies."""
-STEEP = 0.9
+MIN_UPWARD_SINE = 0.9
 """Sine of the elevation from which on a view looks up: at the sky, or a ceiling."""
-CELLS = 16
+FILL_CELLS_PER_SIDE = 16
 """Parts of each side of a picture, by which it is found how much of it is filled."""
-FOCAL = 1.0
+DEFAULT_FOCAL_HEIGHTS = 1.0
 """Focal length in heights of the picture where no camera is known: 53 degrees."""
 
 
 @dataclass(frozen=True)
-class Page(Format):
+class HtmlPageFormat(Format):
     """One HTML file that shows the splats in any browser of today, without a network: to be mailed or put on a site."""
 
     suffix: ClassVar[str] = ".html"
@@ -87,12 +87,12 @@ class Page(Format):
         kept = replace(kept, sh_rest=kept.sh_rest[:, : (self.sh_degree + 1) ** 2 - 1])
         means = kept.means.double().numpy()
         centre = np.median(means, axis=0) if len(means) else np.zeros(3)
-        reach = float(np.quantile(np.linalg.norm(means - centre, axis=1), REACH)) if len(means) else 0.0
-        unit = reach / EXTENT or 1.0
+        reach = float(np.quantile(np.linalg.norm(means - centre, axis=1), EXTENT_SPLAT_SHARE)) if len(means) else 0.0
+        unit = reach / PAGE_RADIUS_UNITS or 1.0
         here = turned(replace(kept, means=kept.means.double() - torch.from_numpy(centre)), np.eye(3), 1 / unit)
         if up is None:
             up = np.array([0.0, 0.0, 1.0]) if frame is not None and frame.crs else np.array([0.0, -1.0, 0.0])
-        seen = [_place(view, frame, centre, unit, here) for view in views[:: max(1, -(-len(views) // MOST_VIEWS))]]
+        seen = [_place(view, frame, centre, unit, here) for view in views[:: max(1, -(-len(views) // MAX_PAGE_VIEWS))]]
         facts = {
             "title": path.stem,
             "told": f"{len(kept):,} splats" + (f" of {len(table):,}" if len(kept) < len(table) else ""),
@@ -129,16 +129,16 @@ def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, her
     pose = frame.input_pose(view.camera.world_to_camera)
     turn = pose[:3, :3]
     eye = (-turn.T @ pose[:3, 3] - centre) / unit
-    few = here.means[:: max(1, len(here) // LOOKED_AT)].double().numpy()
+    few = here.means[:: max(1, len(here) // MAX_DISTANCE_SPLATS)].double().numpy()
     x, y, z = ((few - eye) @ turn.T).T
     camera = view.camera
     inside = (z > 0) & (np.abs(x) * camera.fx < z * camera.width / 2) & (np.abs(y) * camera.fy < z * camera.height / 2)
-    away = float(np.median(z[inside])) if inside.any() else EXTENT
+    away = float(np.median(z[inside])) if inside.any() else PAGE_RADIUS_UNITS
     steps = [
-        (side[inside] / z[inside] * focal / length + 0.5) * CELLS
+        (side[inside] / z[inside] * focal / length + 0.5) * FILL_CELLS_PER_SIDE
         for side, focal, length in ((x, camera.fx, camera.width), (y, camera.fy, camera.height))
     ]
-    filled = len(np.unique(np.stack(steps, 1).astype(int), axis=0)) / CELLS**2
+    filled = len(np.unique(np.stack(steps, 1).astype(int), axis=0)) / FILL_CELLS_PER_SIDE**2
     shape = {"focal": camera.fy / camera.height, "aspect": camera.width / camera.height}
     place = {"eye": eye.tolist(), "turn": turn.ravel().tolist(), "away": away}
     return {"name": view.name, **place, **shape, "shown": filled * float(inside.mean()) if len(few) else 0.0}
@@ -146,7 +146,7 @@ def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, her
 
 def _fit_to_begin(place: dict[str, Any], up: np.ndarray) -> tuple[bool, float]:
     """The higher, the better a page begins there: first of all, it does not look up, as one view of a panorama does."""
-    return bool(np.reshape(place["turn"], (3, 3))[2] @ up < STEEP), place["shown"]
+    return bool(np.reshape(place["turn"], (3, 3))[2] @ up < MIN_UPWARD_SINE), place["shown"]
 
 
 def _overview(up: np.ndarray) -> dict[str, Any]:
@@ -155,11 +155,11 @@ def _overview(up: np.ndarray) -> dict[str, Any]:
     side /= np.linalg.norm(side)
     forward = np.cross(up, side) - 0.7 * up
     forward /= np.linalg.norm(forward)
-    away = 2.5 * EXTENT
+    away = 2.5 * PAGE_RADIUS_UNITS
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
     turn = np.stack([right, np.cross(forward, right), forward])
     place = {"eye": (-away * forward).tolist(), "turn": turn.ravel().tolist(), "away": away}
-    return {"name": "", **place, "focal": FOCAL, "aspect": 1.0}
+    return {"name": "", **place, "focal": DEFAULT_FOCAL_HEIGHTS, "aspect": 1.0}
 
 
 def _filled(title: str, facts: dict[str, Any], splats: bytes) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-BINS = 1 << 12
+VALUE_BINS = 1 << 12
 """Of the histogram that single values are counted in."""
-EVEN = 4
+UNIFORM_SHARE_DIVISOR = 4
 """One of so many codes for single values is spent on even distances, so that rare ones, such as the scales of large
 splats, are off by at most EVEN / size of the span; the others follow the density of the values."""
-PASSES = 6
+LLOYD_PASSES = 6
 """Passes of Lloyd's algorithm over rows."""
-SAMPLE = 64
+SAMPLES_PER_CODE = 64
 """Rows for each code that is learned; the others are only assigned."""
-BLOCK = 1 << 22
+MAX_DISTANCES = 1 << 22
 """Distances in memory."""
 
 
@@ -34,12 +34,14 @@ def codebook(values: np.ndarray, size: int) -> np.ndarray:
     if len(few) <= size and len(few := np.unique(values)) <= size:
         return np.pad(few, (0, size - len(few)), "edge").astype(np.float32)
     low, high = float(values.min()), float(values.max())
-    bins = np.minimum((values - low) * (BINS / (high - low)), BINS - 1).astype(np.int64)
-    count, total = (np.bincount(bins, weight, BINS) for weight in (None, values))
+    bins = np.minimum((values - low) * (VALUE_BINS / (high - low)), VALUE_BINS - 1).astype(np.int64)
+    count, total = (np.bincount(bins, weight, VALUE_BINS) for weight in (None, values))
     dense = count ** (1 / 3)  # the density of the codes with the least mean error, where they are many
-    share = np.cumsum(dense / dense.sum() * (1 - 1 / EVEN) + 1 / EVEN / BINS)
-    codes = np.interp((np.arange(size) + 0.5) / size, share, low + (np.arange(BINS) + 1) * (high - low) / BINS)
-    label = nearest(low + (np.arange(BINS) + 0.5) * (high - low) / BINS, codes)
+    share = np.cumsum(dense / dense.sum() * (1 - 1 / UNIFORM_SHARE_DIVISOR) + 1 / UNIFORM_SHARE_DIVISOR / VALUE_BINS)
+    codes = np.interp(
+        (np.arange(size) + 0.5) / size, share, low + (np.arange(VALUE_BINS) + 1) * (high - low) / VALUE_BINS
+    )
+    label = nearest(low + (np.arange(VALUE_BINS) + 0.5) * (high - low) / VALUE_BINS, codes)
     inside, sums = (np.bincount(label, weight, size) for weight in (count, total))
     return np.sort(np.where(inside > 0, sums / np.maximum(inside, 1), codes)).astype(np.float32)
 
@@ -93,10 +95,10 @@ def _lloyd(rows: np.ndarray, size: int, draw: np.random.Generator) -> tuple[np.n
     """(K, D) codes learned on a sample, and the code of each row."""
     if len(rows) <= size:
         return rows.copy(), np.arange(len(rows), dtype=np.int32)
-    sample = rows[np.sort(draw.choice(len(rows), min(len(rows), SAMPLE * size), replace=False))]
+    sample = rows[np.sort(draw.choice(len(rows), min(len(rows), SAMPLES_PER_CODE * size), replace=False))]
     codes = sample[np.sort(draw.choice(len(sample), size, replace=False))]
     length = (sample**2).sum(1)
-    for _ in range(PASSES):
+    for _ in range(LLOYD_PASSES):
         label, value = _assigned(sample, codes)
         order = np.argsort(label, kind="stable")
         there, starts = np.unique(label[order], return_index=True)
@@ -110,7 +112,7 @@ def _lloyd(rows: np.ndarray, size: int, draw: np.random.Generator) -> tuple[np.n
 
 def _assigned(rows: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the nearest code of each row, int32, and half of its squared distance but for the length of the row."""
-    half, step = (codes**2).sum(1) / 2, max(1, BLOCK // len(codes))
+    half, step = (codes**2).sum(1) / 2, max(1, MAX_DISTANCES // len(codes))
     label, value = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
     for start in range(0, len(rows), step):
         some = half - rows[start : start + step] @ codes.T

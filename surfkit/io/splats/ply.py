@@ -19,13 +19,13 @@ from surfkit.io.splats.base import Format
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
-CHUNK = 1 << 16
+WRITTEN_ROWS = 1 << 16
 """Rows in memory while writing."""
 
-GATHERED = 1 << 12
+READ_ROWS = 1 << 12
 """Rows at a time while reading: a megabyte."""
 
-TYPES = {
+PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
@@ -101,8 +101,10 @@ def write_splats(
     header = _header(len(table), [("float", name) for name in names], [*notes, *comments])
     with replacing(path) as file:
         file.write(header)
-        for start in range(0, len(table), CHUNK):
-            file.write(_rows(table, slice(start, start + CHUNK), axes).numpy().astype("<f4", copy=False).tobytes())
+        for start in range(0, len(table), WRITTEN_ROWS):
+            file.write(
+                _rows(table, slice(start, start + WRITTEN_ROWS), axes).numpy().astype("<f4", copy=False).tobytes()
+            )
 
 
 def mode_of(table: SplatTable) -> str:
@@ -190,10 +192,10 @@ def smoothed(log_scales: Tensor, opacity_logits: Tensor, deviation: Tensor) -> t
 def columns_of(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """(N, len(names)) float32 columns of a record array: a few rows at a time, so that each is read once."""
     found = np.empty((len(rows), len(names)), np.float32)
-    for start in range(0, len(rows), GATHERED):
-        part = np.asarray(rows[start : start + GATHERED])
+    for start in range(0, len(rows), READ_ROWS):
+        part = np.asarray(rows[start : start + READ_ROWS])
         for at, name in enumerate(names):
-            found[start : start + GATHERED, at] = part[name]
+            found[start : start + READ_ROWS, at] = part[name]
     return found
 
 
@@ -335,12 +337,12 @@ def element_layout(path: Path, lines: list[str]) -> tuple[str, int, np.dtype]:
         raise BadInput(f"{path}: the header has {' '.join(head)!r} in place of 'element NAME COUNT'")
     properties = [line.split() for line in lines if line.startswith("property ")]
     for word in properties:
-        if len(word) != 3 or word[1] not in TYPES:
-            raise BadInput(f"{path}: cannot read {' '.join(word)!r} of a {head[1]}; types: {', '.join(TYPES)}")
+        if len(word) != 3 or word[1] not in PLY_TYPES:
+            raise BadInput(f"{path}: cannot read {' '.join(word)!r} of a {head[1]}; types: {', '.join(PLY_TYPES)}")
     names = [word[2] for word in properties]
     if not names or len(set(names)) < len(names):
         raise BadInput(f"{path}: the element {head[1]} has no properties, or one twice: {_short(names)}")
-    return head[1], int(head[2]), np.dtype([(word[2], "<" + TYPES[word[1]]) for word in properties])
+    return head[1], int(head[2]), np.dtype([(word[2], "<" + PLY_TYPES[word[1]]) for word in properties])
 
 
 def _header(count: int, properties: Sequence[tuple[str, str]], comments: Sequence[str]) -> bytes:

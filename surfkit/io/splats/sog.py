@@ -34,13 +34,13 @@ from surfkit.scene.morton import morton_order
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
-ROW = 64
+PALETTE_ROW = 64
 """Rows of the palette in one line of its image."""
 THIN_CODES = 16
 """Codes of the codebook that the third scale of surfels is left: viewers need it flat, not exact."""
-LIMIT = 64.0
+MAX_SH_COEFFICIENT = 64.0
 """Largest coefficient of degrees 1 to 3; real ones are about 1."""
-COARSE = 4
+QUIET_ROUNDING_DIVISOR = 4
 """A share of the median scale by which positions may be rounded without a warning."""
 
 
@@ -106,12 +106,14 @@ class SOG(Format):
         """What stands for the coefficients of higher degree."""
         count = table.sh_rest.shape[1]
         most = min(self.palette, 2 ** int(math.log2(len(table))))
-        rows, label = palette(table.sh_rest.flatten(1).clamp(-LIMIT, LIMIT).numpy()[order], most)
+        rows, label = palette(
+            table.sh_rest.flatten(1).clamp(-MAX_SH_COEFFICIENT, MAX_SH_COEFFICIENT).numpy()[order], most
+        )
         codes = codebook(rows, 256)
-        lines = -(-len(rows) // ROW)
-        picture = np.zeros((lines * ROW, count, 3), np.uint8)
+        lines = -(-len(rows) // PALETTE_ROW)
+        picture = np.zeros((lines * PALETTE_ROW, count, 3), np.uint8)
         picture[: len(rows)] = nearest(rows, codes).reshape(-1, count, 3)
-        picture = _opaque(picture.reshape(lines, ROW * count, 3))
+        picture = _opaque(picture.reshape(lines, PALETTE_ROW * count, 3))
         labels = np.stack([label & 255, label >> 8, np.zeros_like(label)], 1).astype(np.uint8)
         facts = {"count": len(rows), "bands": table.sh_degree, "codebook": codes.tolist()}
         return facts, {"shN_centroids.webp": picture, "shN_labels.webp": _image(labels)}
@@ -124,7 +126,7 @@ class SOG(Format):
         low, high, _ = _positions(means)
         apart = float(np.median((1 + np.abs(means)) * (high - low)) / 65_535)
         scale = table.median_scale()
-        if apart > scale / COARSE:
+        if apart > scale / QUIET_ROUNDING_DIVISOR:
             rounded = f"{apart:.3g} apart, {apart / scale:.2g} x the median scale of the splats"
             emit(Warned(f"{path}: positions are {rounded}; --format ply keeps more of such a large scene"))
 

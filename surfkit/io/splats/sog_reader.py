@@ -21,17 +21,17 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json
 from surfkit.io.splats.bits import from_smallest_three, logits
 from surfkit.io.splats.table import SplatTable
-from surfkit.io.splats.unpack import SMALL, refuse_implausible
+from surfkit.io.splats.unpack import ALWAYS_ALLOWED_BYTES, refuse_implausible
 
-SIDE = 16_383
+MAX_WEBP_SIDE = 16_383
 """Most pixels of a WebP image along a side."""
-HEAD = 30
+WEBP_HEADER_BYTES = 30
 """Bytes of a WebP image in which its size stands."""
-MOST_JSON = 1 << 26
+MAX_META_BYTES = 1 << 26
 """Bytes of a meta.json that are read."""
-GROWTH = 16
+MAX_ARCHIVE_EXPANSION = 16
 """Times that files of the archive may grow: images are compressed already."""
-MODELS = {"2dgs": "surfel", "antialiased": "gaussian", "default": "gaussian"}
+KIND_OF_MODEL = {"2dgs": "surfel", "antialiased": "gaussian", "default": "gaussian"}
 
 
 def is_sog(path: Path, head: bytes) -> bool:
@@ -62,7 +62,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         raise BadInput(f"{path}: no .sog file, or damaged: it has no {name}") from error
     if entry.compress_size > path.stat().st_size:
         raise BadInput(f"{path}: damaged or cut off: {name} would be larger than the file; copy it again")
-    refuse_implausible(path, entry.compress_size, entry.file_size, GROWTH)
+    refuse_implausible(path, entry.compress_size, entry.file_size, MAX_ARCHIVE_EXPANSION)
     return archive.read(entry)
 
 
@@ -77,11 +77,11 @@ def _beside(path: Path, name: str) -> bytes:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
             raise BadInput(f"{path}: {name} is no regular file; copy the files of the archive there again")
-        head = file.read(HEAD)
-        most = MOST_JSON
+        head = file.read(WEBP_HEADER_BYTES)
+        most = MAX_META_BYTES
         if name != "meta.json":
             width, height = _size(path, name, head)
-            most = 4 * width * height + SMALL
+            most = 4 * width * height + ALWAYS_ALLOWED_BYTES
         if found.st_size > most:
             raise BadInput(f"{path}: {name} has {found.st_size:,} bytes, more than it can be of use; copy it again")
         return head + file.read(most)
@@ -114,7 +114,7 @@ def _decoded(path: Path, member: Callable[[str], bytes]) -> SplatTable:
         antialias=model == "antialiased",
     )
     table.refuse_unsound(path)
-    return table.as_surfels() if MODELS[model] == "surfel" else table
+    return table.as_surfels() if KIND_OF_MODEL[model] == "surfel" else table
 
 
 def _harmonics(meta: _Meta, count: int) -> np.ndarray:
@@ -160,7 +160,7 @@ class _Meta:
     def whole(self, *keys: str) -> int:
         """A whole number of 0 or more."""
         value = self.entry(*keys)
-        if type(value) is not int or not 0 <= value <= SIDE**2:
+        if type(value) is not int or not 0 <= value <= MAX_WEBP_SIDE**2:
             raise BadInput(f"{self.path}: meta.json: {'.'.join(keys)} is {_shown(value)}, no whole number that can be")
         return value
 
@@ -179,7 +179,7 @@ class _Meta:
     def model(self) -> str:
         """What the splats are."""
         model = self.entry("model")
-        if not isinstance(model, str) or model not in MODELS:
+        if not isinstance(model, str) or model not in KIND_OF_MODEL:
             model = "default"
         return "antialiased" if model == "default" and self.entry("antialias") is True else model
 
@@ -220,7 +220,7 @@ def _pixels(path: Path, name: str, data: bytes) -> np.ndarray:
 
 def _size(path: Path, name: str, data: bytes) -> tuple[int, int]:
     """Width and height in the header of a WebP image."""
-    if len(data) >= HEAD and data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if len(data) >= WEBP_HEADER_BYTES and data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         if data[12:16] == b"VP8L":
             bits = struct.unpack_from("<I", data, 21)[0]
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1

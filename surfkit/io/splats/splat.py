@@ -17,13 +17,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import SH_C0, logits, sigmoid, to_bytes
-from surfkit.io.splats.ply import CHUNK
+from surfkit.io.splats.ply import WRITTEN_ROWS
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
-ROW = np.dtype([("xyz", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
-SMALLEST = float(np.finfo(np.float32).tiny)
+SPLAT_DTYPE = np.dtype([("xyz", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
+MIN_READ_SCALE = float(np.finfo(np.float32).tiny)
 """Scales of 0 are read as this, which has a logarithm."""
 
 
@@ -41,11 +41,11 @@ class Splat(Format):
         size = np.exp(table.log_scales.detach().cpu().double().sum(1).numpy().clip(-600, 600))
         order = np.argsort(-size * opacities, kind="stable")  # viewers show what has arrived: the largest first
         with replacing(path) as file:
-            for start in range(0, len(order), CHUNK):
-                part = torch.from_numpy(order[start : start + CHUNK])
-                rows = np.empty(len(part), ROW)
+            for start in range(0, len(order), WRITTEN_ROWS):
+                part = torch.from_numpy(order[start : start + WRITTEN_ROWS])
+                rows = np.empty(len(part), SPLAT_DTYPE)
                 rows["xyz"] = means[part]
-                rows["scales"] = scales[part].double().exp().clamp(SMALLEST, float(np.finfo(np.float32).max))
+                rows["scales"] = scales[part].double().exp().clamp(MIN_READ_SCALE, float(np.finfo(np.float32).max))
                 colors = 0.5 + SH_C0 * table.sh0.detach().cpu()[part].float().clamp(-9, 9).numpy()
                 rows["rgba"][:, :3] = to_bytes(255 * colors)
                 rows["rgba"][:, 3] = to_bytes(255 * opacities[part.numpy()])
@@ -56,9 +56,11 @@ class Splat(Format):
         """See `Format.read`."""
         try:
             size = Path(path).stat().st_size
-            if size % ROW.itemsize:
-                raise BadInput(f"{path}: {size} bytes are no .splat file, which has {ROW.itemsize} for each splat")
-            rows = np.memmap(path, ROW, "r") if size else np.empty(0, ROW)
+            if size % SPLAT_DTYPE.itemsize:
+                raise BadInput(
+                    f"{path}: {size} bytes are no .splat file, which has {SPLAT_DTYPE.itemsize} for each splat"
+                )
+            rows = np.memmap(path, SPLAT_DTYPE, "r") if size else np.empty(0, SPLAT_DTYPE)
         except OSError as error:
             raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
         scales = np.array(rows["scales"])
@@ -68,7 +70,7 @@ class Splat(Format):
             kind="gaussian",
             means=torch.from_numpy(np.array(rows["xyz"])),
             quats=torch.from_numpy((rows["rot"].astype(np.float32) - 128) / 128),
-            log_scales=torch.from_numpy(np.log(np.maximum(scales, np.float32(SMALLEST)))),
+            log_scales=torch.from_numpy(np.log(np.maximum(scales, np.float32(MIN_READ_SCALE)))),
             opacity_logits=torch.from_numpy(logits(rows["rgba"][:, 3] / 255)),
             sh0=torch.from_numpy((rows["rgba"][:, :3].astype(np.float32) / 255 - 0.5) / np.float32(SH_C0)),
             sh_rest=torch.zeros(len(rows), 0, 3),

@@ -26,27 +26,39 @@ from torch import Tensor
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
-from surfkit.io.splats.axes import NAMES, PLY_AXES, FileAxes, turn_between
+from surfkit.io.splats.axes import AXES_NAMES, PLY_AXES, FileAxes, turn_between
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import sigmoid, smallest_three, to_bytes
-from surfkit.io.splats.ply import CHUNK
-from surfkit.io.splats.spz_reader import AXES_RECORD, COLOR, EXTENDED, HEADER, LARGEST, MAGIC, SMALLEST, STEP, decoded
+from surfkit.io.splats.ply import WRITTEN_ROWS
+from surfkit.io.splats.spz_reader import (
+    AXES_RECORD,
+    COLOR_SCALE,
+    EXTENDED,
+    HEADER,
+    LOG_SCALE_STEP,
+    MAX_LOG_SCALE,
+    MIN_LOG_SCALE,
+    SPZ_MAGIC,
+    decoded,
+)
 from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.io.splats.turn import turned
 from surfkit.scene.morton import morton_order
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 
-FINE = 64
+FINEST_ROUNDING_DIVISOR = 64
 """Positions are rounded to no less than this share of the median scale: finer bits are noise that takes space."""
-COARSE = 4
+QUIET_ROUNDING_DIVISOR = 4
 """A share of the median scale by which positions may be rounded without a warning."""
-TURNED = [(-1) ** ((m < 0) + (degree - abs(m)) % 2) for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
+HALF_TURN_SIGNS = [
+    (-1) ** ((m < 0) + (degree - abs(m)) % 2) for degree in (1, 2, 3) for m in range(-degree, degree + 1)
+]
 """Signs of spherical harmonics after half a turn about x: orders m < 0 are odd in y, odd degree - |m| is odd in z."""
-LEVEL = 12
+SPZ_ZSTD_LEVEL = 12
 """Of zstd, as in the library of Niantic."""
 
-SPZ_ROUNDING = (STEP / 2 + 1e-4, SMALLEST)
+SPZ_ROUNDING = (LOG_SCALE_STEP / 2 + 1e-4, MIN_LOG_SCALE)
 """Of logarithms of scales, and the smallest of them, for `as_surfels_if_thin`."""
 
 Encode = Callable[[np.ndarray], np.ndarray]
@@ -98,9 +110,9 @@ class SPZ(Format):
         order = torch.from_numpy(morton_order(table.means.double().numpy()))
         record = b""
         if self.version == 4 and self.axes == "same":
-            record = struct.pack("<III", AXES_RECORD, 4, NAMES.index(PLY_AXES) + 1)
+            record = struct.pack("<III", AXES_RECORD, 4, AXES_NAMES.index(PLY_AXES) + 1)
         flags = int(table.antialias) | EXTENDED * bool(record)
-        head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, flags)
+        head = struct.pack("<4sIIBBB", SPZ_MAGIC, self.version, len(table), table.sh_degree, bits, flags)
         streams = [_parts(column, order, encode) for column, encode in self._attributes(table, bits)]
         if self.version == 4:
             yield _container(head, record, streams, len(table))
@@ -117,14 +129,14 @@ class SPZ(Format):
         reach = float(table.means.abs().max()) if len(table) else 1.0
         most = min(23, math.floor(math.log2((2**23 - 1) / max(reach, 2.0**-23))))
         scale = table.median_scale()
-        wanted = math.ceil(math.log2(FINE / scale))
+        wanted = math.ceil(math.log2(FINEST_ROUNDING_DIVISOR / scale))
         bits = self.fractional_bits if self.fractional_bits is not None else max(0, min(most, wanted))
         if bits > most:
             raise BadInput(
                 f"{path}: coordinates up to {reach:.6g} have no place in 24 bits with {bits} after the point; "
                 + (f"at most {most} leave room" if most >= 0 else "move the splats towards 0, or take another format")
             )
-        if len(table) and 2.0**-bits > scale / COARSE:
+        if len(table) and 2.0**-bits > scale / QUIET_ROUNDING_DIVISOR:
             rounded = f"{2.0**-bits:.3g} apart, {2.0**-bits / scale:.2g} x the median scale of the splats"
             emit(Warned(f"{path}: positions are {rounded}; --format ply keeps more of such a large scene"))
         return bits
@@ -135,8 +147,8 @@ class SPZ(Format):
         return [
             (table.means, lambda means: _positions(means, bits)),
             (table.opacity_logits, lambda logits: to_bytes(255 * sigmoid(logits))),
-            (table.sh0, lambda sh0: to_bytes(255 * (COLOR * sh0.clip(-9, 9) + 0.5))),
-            (table.ellipsoid_log_scales(), lambda scales: to_bytes((scales - SMALLEST) / STEP)),
+            (table.sh0, lambda sh0: to_bytes(255 * (COLOR_SCALE * sh0.clip(-9, 9) + 0.5))),
+            (table.ellipsoid_log_scales(), lambda scales: to_bytes((scales - MIN_LOG_SCALE) / LOG_SCALE_STEP)),
             (table.quats, _rotations if self.version > 2 else _short_rotations),
             *(rest if table.sh_degree else ()),
         ]
@@ -161,12 +173,12 @@ class SPZ(Format):
                 head = zlib.decompressobj(31).decompress(head, 4)
             except zlib.error:
                 return path.suffix.lower() == self.suffix
-        return head.startswith(MAGIC)
+        return head.startswith(SPZ_MAGIC)
 
     def rounding(self, table: SplatTable) -> str:
         """See `Format.rounding`."""
         scales = table.log_scales[:, :2]
-        outside = int(((scales < SMALLEST) | (scales > LARGEST)).any(1).sum())
+        outside = int(((scales < MIN_LOG_SCALE) | (scales > MAX_LOG_SCALE)).any(1).sum())
         clipped = (
             f"; splats smaller or larger than it has a place for: {outside:,} of {len(table):,}" if outside else ""
         )
@@ -201,7 +213,7 @@ def spz_table(data: bytes, where: Path) -> SplatTable:
 def half_turn(table: SplatTable) -> SplatTable:
     """The same splats after half a turn about x, which is also the way back."""
     axes = torch.tensor([1, -1, -1])
-    signs = torch.tensor(TURNED[: table.sh_rest.shape[1]], dtype=table.sh_rest.dtype)
+    signs = torch.tensor(HALF_TURN_SIGNS[: table.sh_rest.shape[1]], dtype=table.sh_rest.dtype)
     return replace(
         table,
         means=table.means * axes,
@@ -212,15 +224,15 @@ def half_turn(table: SplatTable) -> SplatTable:
 
 def _parts(column: Tensor, order: Tensor, encode: Encode) -> Iterator[bytes]:
     """The bytes of one attribute, in pieces."""
-    for start in range(0, len(order), CHUNK):
-        yield encode(column[order[start : start + CHUNK]].numpy()).tobytes()
+    for start in range(0, len(order), WRITTEN_ROWS):
+        yield encode(column[order[start : start + WRITTEN_ROWS]].numpy()).tobytes()
 
 
 def _container(head: bytes, record: bytes, streams: list[Iterator[bytes]], count: int) -> bytes:
     """A file of version 4, with a record of an extension or none."""
     packed, sizes = [], []
     for stream in streams if count else ():
-        squeeze, size, pieces = zstandard.ZstdCompressor(level=LEVEL).compressobj(), 0, []
+        squeeze, size, pieces = zstandard.ZstdCompressor(level=SPZ_ZSTD_LEVEL).compressobj(), 0, []
         for part in stream:
             size += len(part)
             pieces.append(squeeze.compress(part))

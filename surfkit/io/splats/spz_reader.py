@@ -11,21 +11,21 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.splats.axes import NAMES, Axes
+from surfkit.io.splats.axes import AXES_NAMES, Axes
 from surfkit.io.splats.bits import from_smallest_three, logits
 from surfkit.io.splats.table import SplatTable
 from surfkit.io.splats.unpack import inflated, unpacked_zstd
 
-MAGIC = b"NGSP"
-COLOR = 0.15
+SPZ_MAGIC = b"NGSP"
+COLOR_SCALE = 0.15
 """What a coefficient of degree 0 is multiplied by: colours beyond [0, 1] have a place too."""
-SMALLEST, LARGEST = -10.0, 255 / 16 - 10
+MIN_LOG_SCALE, MAX_LOG_SCALE = -10.0, 255 / 16 - 10
 """Logarithms of the smallest and largest scale."""
-STEP = 1 / 16
+LOG_SCALE_STEP = 1 / 16
 """Between logarithms of scales."""
 HEADER = 32
 """Bytes of the header of version 4."""
-MOST_DEGREE = 3
+MAX_SH_DEGREE = 3
 """Of the spherical harmonics that are kept; files have up to 4."""
 EXTENDED = 2
 """Flag of a file with records of extensions, each a number, the bytes that follow, and these."""
@@ -40,8 +40,8 @@ def decoded(path: Path, data: bytes) -> tuple[SplatTable, Axes | None]:
         BadInput: No such data, or damaged; `path` begins messages.
     """
     header, streams, records = _streams(path, data)
-    if header.degree > MOST_DEGREE and header.count:
-        emit(Warned(f"{path}: spherical harmonics of degree {header.degree} are cut to {MOST_DEGREE}"))
+    if header.degree > MAX_SH_DEGREE and header.count:
+        emit(Warned(f"{path}: spherical harmonics of degree {header.degree} are cut to {MAX_SH_DEGREE}"))
     return _decoded(header, streams), _named_axes(path, records) if header.is_extended else None
 
 
@@ -70,11 +70,11 @@ class Header:
 
 def _streams(path: Path, data: bytes) -> tuple[Header, list[bytes], bytes]:
     """The header of a file, the bytes of each attribute, and those of the records of extensions."""
-    if data.startswith(MAGIC):
+    if data.startswith(SPZ_MAGIC):
         header = _header(path, data, (4,))
         return header, *_unpacked(path, data, header)
     if not data.startswith(b"\x1f\x8b"):
-        raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {MAGIC.decode()}")
+        raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {SPZ_MAGIC.decode()}")
     header = _header(path, inflated(path, data, 16, part=True), (1, 2, 3))
     body, streams, at = inflated(path, data, 16 + sum(header.sizes)), [], 16
     for size in header.sizes:
@@ -94,13 +94,13 @@ def _named_axes(path: Path, records: bytes) -> Axes | None:
                 raise BadInput(f"{path}: damaged: the record of its axes is cut off; write or copy it again")
             found = struct.unpack_from("<I", records, at)[0]
         at += size
-    if found > len(NAMES):
-        raise BadInput(f"{path}: it names axes by the number {found}; 1 to {len(NAMES)} are known; write it again")
-    return NAMES[found - 1] if found else None
+    if found > len(AXES_NAMES):
+        raise BadInput(f"{path}: it names axes by the number {found}; 1 to {len(AXES_NAMES)} are known; write it again")
+    return AXES_NAMES[found - 1] if found else None
 
 
 def _header(path: Path, data: bytes, versions: tuple[int, ...]) -> Header:
-    if len(data) < 16 or not data.startswith(MAGIC):
+    if len(data) < 16 or not data.startswith(SPZ_MAGIC):
         raise BadInput(f"{path}: no .spz file, or cut off: it has no header")
     version, count, degree, bits, flags = struct.unpack_from("<IIBBB", data, 4)
     if version not in versions:
@@ -137,14 +137,14 @@ def _decoded(header: Header, streams: list[bytes]) -> SplatTable:
     ]
     means, alphas, colors, scales, turns = raw[:5]
     rest = raw[5] if header.degree else np.zeros((header.count, 0), np.uint8)
-    coefficients = rest.reshape(header.count, (header.degree + 1) ** 2 - 1, 3)[:, : (MOST_DEGREE + 1) ** 2 - 1]
+    coefficients = rest.reshape(header.count, (header.degree + 1) ** 2 - 1, 3)[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
     return SplatTable(
         kind="gaussian",
         means=torch.from_numpy(_decoded_positions(means, header)),
         quats=torch.from_numpy(_decoded_rotations(turns, header)),
-        log_scales=torch.from_numpy(scales.astype(np.float32) * STEP + SMALLEST),
+        log_scales=torch.from_numpy(scales.astype(np.float32) * LOG_SCALE_STEP + MIN_LOG_SCALE),
         opacity_logits=torch.from_numpy(logits(alphas.reshape(-1) / 255)),
-        sh0=torch.from_numpy((colors.astype(np.float32) / 255 - 0.5) / COLOR),
+        sh0=torch.from_numpy((colors.astype(np.float32) / 255 - 0.5) / COLOR_SCALE),
         sh_rest=torch.from_numpy((coefficients.astype(np.float32) - 128) / 128),
         antialias=header.antialias,
     )

@@ -17,15 +17,15 @@ from surfkit.scene.scene import Frame
 THINNESS = 1e-3
 """Thickness of a surfel where ellipsoids are needed, as a share of its smaller radius: flat in every viewer, and free
 of units."""
-THIN = 10.0
+SURFEL_SCALE_RATIO = 10.0
 """Where a file does not say so, splats are surfels only if their third scale is this many times smaller than the
 others."""
 
-LARGEST = 1e18
+MAX_SPLAT_VALUE = 1e18
 """No value of a splat lies further from 0: squares of larger ones have no place in float32."""
-OPAQUE = 18.0
+OPAQUE_LOGIT = 18.0
 """The logit of an opacity that is 1 in float32."""
-COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
+SPLAT_COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 """Tensors of a table, a row for each splat."""
 
 
@@ -99,7 +99,7 @@ class SplatTable:
             return self
         smaller, third = self.log_scales[:, :2].amin(1), self.log_scales[:, 2]
         expected = (smaller + math.log(THINNESS)).clamp_min(least)
-        thin = (third - expected).max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
+        thin = (third - expected).max() <= 2 * rounding and (smaller - third).median() >= math.log(SURFEL_SCALE_RATIO)
         return self.as_surfels() if thin else self
 
     def without_infinities(self) -> SplatTable:
@@ -109,7 +109,7 @@ class SplatTable:
         smallest = torch.where(scales.isfinite(), scales, math.inf).amin(1, keepdim=True) + math.log(THINNESS)
         return replace(
             self,
-            opacity_logits=torch.where(logits.isinf(), logits.sign() * OPAQUE, logits),
+            opacity_logits=torch.where(logits.isinf(), logits.sign() * OPAQUE_LOGIT, logits),
             log_scales=torch.where(scales.isneginf(), smallest, scales),
         )
 
@@ -122,14 +122,14 @@ class SplatTable:
 
     def refuse_unsound(self, where: object) -> None:
         """BadInput if a value is NaN, Inf or beyond LARGEST; `where` is the file that the message names."""
-        for name in COLUMNS:
+        for name in SPLAT_COLUMNS:
             column = getattr(self, name)
             if not column.numel():
                 continue
             least, most = torch.aminmax(column)  # NaN wins, and no mask of the whole column is made
-            if not (-LARGEST <= least and most <= LARGEST):
-                row = int((~(column.abs() <= LARGEST)).nonzero()[0, 0])
-                what = f"{name} of splat {row} of {len(self)} has NaN, Inf or a value beyond {LARGEST:g}"
+            if not (-MAX_SPLAT_VALUE <= least and most <= MAX_SPLAT_VALUE):
+                row = int((~(column.abs() <= MAX_SPLAT_VALUE)).nonzero()[0, 0])
+                what = f"{name} of splat {row} of {len(self)} has NaN, Inf or a value beyond {MAX_SPLAT_VALUE:g}"
                 raise BadInput(f"{where}: {what}; remove such splats first")
 
     def shown(self) -> Tensor:
@@ -143,7 +143,7 @@ class SplatTable:
 
     def on_cpu(self) -> SplatTable:
         """The same splats on the CPU and without gradients: positions as they are, all else in float32."""
-        columns = {name: getattr(self, name).detach().to("cpu", torch.float32) for name in COLUMNS[1:]}
+        columns = {name: getattr(self, name).detach().to("cpu", torch.float32) for name in SPLAT_COLUMNS[1:]}
         return replace(self, means=self.means.detach().cpu(), **columns)
 
     def in_local_frame(self, frame: Frame) -> SplatTable:
@@ -153,7 +153,7 @@ class SplatTable:
 
     def take(self, rows: Tensor | slice) -> SplatTable:
         """The splats of a mask, of indices or of a slice."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
+        return replace(self, **{name: getattr(self, name)[rows] for name in SPLAT_COLUMNS})
 
 
 @dataclass(frozen=True)

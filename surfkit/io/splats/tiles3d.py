@@ -27,9 +27,9 @@ from surfkit.io.splats.tileset import INDEX, box_json, ground_of, tileset
 from surfkit.scene.rotations import numpy_rotations
 from surfkit.scene.scene import Frame
 
-SIGMAS = 3.0
+BOX_SIGMAS = 3.0
 """Standard deviations of a splat that the box of a tile contains; viewers draw no more."""
-PIXELS = 16.0
+REFINE_ERROR_PX = 16.0
 """Geometric errors of as many pixels or more make viewers refine, by default."""
 CONTENT = "3DTILES_content_gltf"
 
@@ -84,7 +84,7 @@ class Tiles3D(Format):
             return SPZ(version=2).rounding(table)
         return "nothing is rounded but positions, to float32"
 
-    def _place(self, path: Path, frame: Frame | None) -> Place:
+    def _place(self, path: Path, frame: Frame | None) -> TileOrigin:
         """From the coordinates of the table to metres in a tileset, and from there to Earth."""
         turn = UPS["z"].T @ UPS[up_of(self.up, frame)]
         ground = ground_of(path, frame, turn, self.georeference, self.geoid or None)
@@ -93,9 +93,9 @@ class Tiles3D(Format):
             means = torch.from_numpy(ground.metres(table.means.detach().cpu().double().numpy()))
             return replace(table, means=means, log_scales=table.log_scales + float(np.log(ground.unit)))
 
-        return Place(moved, ground.unit * PIXELS / self.error_px, ground.matrix)
+        return TileOrigin(moved, ground.unit * REFINE_ERROR_PX / self.error_px, ground.matrix)
 
-    def _index(self, root: dict[str, Any], place: Place) -> dict[str, Any]:
+    def _index(self, root: dict[str, Any], place: TileOrigin) -> dict[str, Any]:
         """The JSON of a tileset."""
         names = {"extensionsUsed": extensions_of(self.compress)}
         if self.compress == "spz":
@@ -104,7 +104,7 @@ class Tiles3D(Format):
 
 
 @dataclass(frozen=True)
-class Place:
+class TileOrigin:
     """Where the tiles lie.
 
     Attributes:
@@ -119,7 +119,7 @@ class Place:
 
 
 def _written(
-    folder: Path, tile: Tile, name: str, place: Place, compress: Compress
+    folder: Path, tile: Tile, name: str, place: TileOrigin, compress: Compress
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Write the splats of a tile and of all below it; its JSON, and the (2, 3) corners of its box."""
     below = [
@@ -146,9 +146,9 @@ def _written(
 
 
 def box_of(table: SplatTable) -> np.ndarray:
-    """(2, 3) corners of the box about all splats, `SIGMAS` standard deviations around each."""
+    """(2, 3) corners of the box about all splats, `BOX_SIGMAS` standard deviations around each."""
     turns = torch.from_numpy(numpy_rotations(table.quats.numpy()))
-    reach = SIGMAS * (turns * table.ellipsoid_log_scales().double().exp()[:, None]).norm(dim=2)
+    reach = BOX_SIGMAS * (turns * table.ellipsoid_log_scales().double().exp()[:, None]).norm(dim=2)
     means = table.means.double()
     return np.stack([(means - reach).amin(0).numpy(), (means + reach).amax(0).numpy()])
 

@@ -16,7 +16,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.version import own_version
 from surfkit.scene.crs import refuse_other_unit
-from surfkit.scene.earth import Site
+from surfkit.scene.earth import LocalEarthFrame
 from surfkit.scene.geoid import geoid_of
 from surfkit.scene.scene import Frame
 
@@ -24,7 +24,7 @@ INDEX = "tileset.json"
 
 
 @dataclass(frozen=True)
-class Ground:
+class TilesetPlacement:
     """Where a tileset lies.
 
     Attributes:
@@ -40,7 +40,7 @@ class Ground:
 
 def ground_of(
     path: Path, frame: Frame | None, turn: np.ndarray, georeference: bool = True, geoid: str | None = None
-) -> Ground:
+) -> TilesetPlacement:
     """The place of a tileset: on Earth, if the data set has a coordinate reference system, else about its centre.
 
     Args:
@@ -57,7 +57,7 @@ def ground_of(
     if site is not None:
         for note in site.notes:
             emit(Warned(note))
-        return Ground(site.local, site.unit, site.pose)
+        return TilesetPlacement(site.local, site.unit, site.pose)
     if georeference:
         emit(
             Warned(
@@ -68,10 +68,10 @@ def ground_of(
     unit, shift = (frame.metres if frame else None) or 1.0, frame.shift if frame else (0.0, 0.0, 0.0)
     matrix = np.eye(4)
     matrix[:3, :3] = turn
-    return Ground(lambda xyz: (xyz - np.array(shift)) * unit, unit, matrix)
+    return TilesetPlacement(lambda xyz: (xyz - np.array(shift)) * unit, unit, matrix)
 
 
-def site_of(frame: Frame | None, geoid: str | None = None) -> Site | None:
+def site_of(frame: Frame | None, geoid: str | None = None) -> LocalEarthFrame | None:
     """Where on Earth the scene of a data set lies; None if it has no coordinate reference system.
 
     Args:
@@ -86,7 +86,7 @@ def site_of(frame: Frame | None, geoid: str | None = None) -> Site | None:
             raise BadInput(f"--geoid {geoid}: the data set has no coordinate reference system; leave it out")
         return None
     refuse_other_unit(frame.crs, frame.metres, frame.origin)
-    return Site.at(frame.crs, frame.origin, None if geoid is None else geoid_of(geoid))
+    return LocalEarthFrame.at(frame.crs, frame.origin, None if geoid is None else geoid_of(geoid))
 
 
 def box_json(corners: np.ndarray) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def tileset(root: dict[str, Any], matrix: np.ndarray, **more: Any) -> dict[str, 
 
     Args:
         root: The root tile, with a box.
-        matrix: (4, 4) see `Ground`.
+        matrix: (4, 4) see `TilesetPlacement`.
         more: Other members of the JSON.
     """
     if not np.array_equal(matrix, np.eye(4)):

@@ -13,9 +13,9 @@ from surfkit.core.check import BadInput
 from surfkit.io.splats.table import SplatTable
 from surfkit.scene.rotations import numpy_quaternions
 
-TOLERANCE = 1e-4
+MAX_ORTHOGONALITY_ERROR = 1e-4
 """Most by which the columns of a matrix may differ from perpendicular and equally long."""
-DIRECTIONS = 64
+TEST_DIRECTIONS = 64
 """On which two sets of coefficients must give the same colours; degree 3 has 16 unknowns."""
 
 
@@ -61,7 +61,7 @@ def parts_of(matrix: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     sound = np.isfinite(matrix).all() and scale > 0 and np.array_equal(matrix[3], [0, 0, 0, 1])
     if sound:
         apart = np.abs(inner.T @ inner / scale**2 - np.eye(3)).max()
-        sound = apart < TOLERANCE and np.linalg.det(inner) > 0
+        sound = apart < MAX_ORTHOGONALITY_ERROR and np.linalg.det(inner) > 0
     if not sound:
         raise BadInput("a node mirrors, shears or stretches; only nodes that turn, move and scale evenly are read")
     return (np.eye(3) if np.array_equal(inner, scale * np.eye(3)) else inner / scale), scale, matrix[:3, 3]
@@ -91,7 +91,7 @@ def _turned_harmonics(rest: Tensor, turn: np.ndarray) -> Tensor:
     degree = math.isqrt(rest.shape[1] + 1) - 1
     if not degree:
         return rest
-    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions = np.random.default_rng(0).normal(size=(TEST_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     new, old = basis(directions, degree), basis(directions @ turn, degree)
     mix = np.zeros((rest.shape[1], rest.shape[1]))

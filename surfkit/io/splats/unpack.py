@@ -9,17 +9,17 @@ import zstandard
 
 from surfkit.core.check import BadInput
 
-MOST = 1024
+MAX_EXPANSION = 1024
 """Times that compressed bytes may grow: about what gzip can do, far more than splats do."""
-BEHIND = 1 << 16
+MAX_TRAILING_BYTES = 1 << 16
 """Bytes of extensions that may follow the splats in a gzip stream."""
-SMALL = 1 << 22
+ALWAYS_ALLOWED_BYTES = 1 << 22
 """Bytes that may be allocated whatever the size of the file."""
 
 
-def refuse_implausible(path: Path, packed: int, size: int, most: int = MOST) -> None:
+def refuse_implausible(path: Path, packed: int, size: int, most: int = MAX_EXPANSION) -> None:
     """BadInput if a file says that some of its bytes become more than `most` times as many."""
-    if size > most * packed + SMALL:
+    if size > most * packed + ALWAYS_ALLOWED_BYTES:
         raise BadInput(f"{path}: damaged: {packed:,} bytes cannot hold {size:,}; write or copy it again")
 
 
@@ -31,7 +31,7 @@ def inflated(path: Path, data: bytes, size: int, part: bool = False) -> bytes:
     try:
         found = stream.decompress(data, size)
         if not part and not stream.eof:
-            found += stream.decompress(stream.unconsumed_tail, BEHIND)
+            found += stream.decompress(stream.unconsumed_tail, MAX_TRAILING_BYTES)
     except zlib.error as error:
         raise BadInput(f"{path}: damaged: {error}; write or copy it again") from error
     if len(found) < size or not (part or stream.eof):

@@ -11,24 +11,35 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.mesh.lattice import BITS, BLOCK_BYTES, MOST, REACH, SIDE, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.lattice import (
+    BLOCK_BYTES,
+    BLOCK_INDEX_BITS,
+    BLOCK_REACH_VOXELS,
+    BLOCK_SIDE_VOXELS,
+    MAX_BLOCKS_FROM_ORIGIN,
+    Corner,
+    FusionImage,
+    Lattice,
+    SurfacePatch,
+    TsdfGrid,
+)
 from surfkit.mesh.native import grid
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.scene.camera import Camera
 
-THREADS = 128
+THREADS_PER_BLOCK = 128
 """Of a block."""
-CHUNK = 1 << 14
+CHUNK_BLOCKS = 1 << 14
 """Blocks whose voxels lie in one allocation, 59 MB: nothing is moved when a grid grows."""
-SHARE = 0.5
+GRID_MEMORY_SHARE = 0.5
 """Of the free memory of the GPU that a grid may take; views are drawn in the rest."""
 Voxels = tuple[Tensor, Tensor, Tensor]
 """Distances (B, 512) int16, weights (B, 512) uint16 as int16, and colours (B, 3, 512) uint8, of blocks."""
 
 
-class View(ctypes.Structure):
-    """`View` of fuse.cu."""
+class GridView(ctypes.Structure):
+    """`GridView` of fuse.cu."""
 
     _fields_ = (
         ("turn", ctypes.c_double * 9),
@@ -45,10 +56,10 @@ class View(ctypes.Structure):
     )
 
 
-SOURCE = Source(Path(__file__).with_name("fuse.cu"), structures={"View": View}, is_exact=True)
+FUSION_SOURCE = CudaSource(Path(__file__).with_name("fuse.cu"), structures={"View": GridView}, is_exact=True)
 
 
-class GpuGrid(Grid):
+class GpuGrid(TsdfGrid):
     """Holds the same bits as the grid of the CPU.
 
     The voxels of the block at place i of `keys` are those of row i of all chunks together. The keys are also kept
@@ -56,7 +67,7 @@ class GpuGrid(Grid):
     """
 
     def __init__(self, lattice: Lattice, device: torch.device, on: Kernels | None = None) -> None:
-        self.lattice, self.device, self.on = lattice, device, on or kernels(SOURCE, device)
+        self.lattice, self.device, self.on = lattice, device, on or kernels(FUSION_SOURCE, device)
         self.keys = torch.empty(0, dtype=torch.int64, device=device)
         self.sorted, self.order = self.keys, self.keys
         self.chunks: list[Voxels] = []
@@ -67,9 +78,9 @@ class GpuGrid(Grid):
 
     @property
     def bytes(self) -> int:
-        return len(self.chunks) * CHUNK * BLOCK_BYTES
+        return len(self.chunks) * CHUNK_BLOCKS * BLOCK_BYTES
 
-    def fuse(self, picture: Picture, carve: bool) -> bool:
+    def fuse(self, picture: FusionImage, carve: bool) -> bool:
         view = view_of(self.lattice, picture.camera)
         depth = self._uploaded(np.ascontiguousarray(picture.depth, np.float32))
         slant = self._uploaded(np.ascontiguousarray(picture.slants, np.float32))
@@ -87,25 +98,27 @@ class GpuGrid(Grid):
         self.sorted, self.order = self.keys.sort()
         maps = offsets, depth, slant, shade
         for begin, some, chunk in self._by_chunk(rows, carve):
-            self.on.launch("fuse", len(some), THREADS, view, self.keys, some, begin, *maps, *chunk)
+            self.on.launch("fuse", len(some), THREADS_PER_BLOCK, view, self.keys, some, begin, *maps, *chunk)
         return True
 
-    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
+    def surface(
+        self, least_weight: int, end: Corner = (MAX_BLOCKS_FROM_ORIGIN,) * 3, with_edges: bool = False
+    ) -> SurfacePatch:
         host = grid(self.lattice)
         for at, chunk in enumerate(self.chunks):
-            keys = self.keys[at * CHUNK : (at + 1) * CHUNK].cpu().numpy()
+            keys = self.keys[at * CHUNK_BLOCKS : (at + 1) * CHUNK_BLOCKS].cpu().numpy()
             distance, weight, color = (voxels[: len(keys)].cpu().numpy() for voxels in chunk)
             host.put(keys, distance, weight.view(np.uint16), color)
         return host.surface(least_weight, end, with_edges)
 
-    def _seen_by(self, view: View, depth: Tensor, shade: Tensor) -> Tensor:
+    def _seen_by(self, view: GridView, depth: Tensor, shade: Tensor) -> Tensor:
         """Sorted keys of the blocks within reach of what the pixels show."""
         found = torch.empty(depth.numel(), dtype=torch.int64, device=self.device)
         self.on.launch("reach", -(-depth.numel() // 256), 256, view, depth, shade, found)
         found = found.unique()
         found = found[found >= 0]
         steps = torch.arange(8, device=self.device)
-        further = (steps & 1) + ((steps >> 1 & 1) << BITS) + (steps >> 2 << 2 * BITS)
+        further = (steps & 1) + ((steps >> 1 & 1) << BLOCK_INDEX_BITS) + (steps >> 2 << 2 * BLOCK_INDEX_BITS)
         wanted = (found[:, None] & steps) == steps
         return torch.where(wanted, (found[:, None] >> 3) + further, found[:, None] >> 3).unique()
 
@@ -121,44 +134,48 @@ class GpuGrid(Grid):
         if blocks > self.lattice.most_blocks:
             return False
         try:
-            while len(self.chunks) * CHUNK < blocks:
-                made = ((SIDE**3,), torch.int16), ((SIDE**3,), torch.int16), ((3, SIDE**3), torch.uint8)
+            while len(self.chunks) * CHUNK_BLOCKS < blocks:
+                made = (
+                    ((BLOCK_SIDE_VOXELS**3,), torch.int16),
+                    ((BLOCK_SIDE_VOXELS**3,), torch.int16),
+                    ((3, BLOCK_SIDE_VOXELS**3), torch.uint8),
+                )
                 self.chunks.append(
-                    tuple(torch.zeros(CHUNK, *shape, dtype=dtype, device=self.device) for shape, dtype in made)
+                    tuple(torch.zeros(CHUNK_BLOCKS, *shape, dtype=dtype, device=self.device) for shape, dtype in made)
                 )
         except torch.cuda.OutOfMemoryError:
             if not self.chunks:
-                raise no_room(self.device, CHUNK * BLOCK_BYTES) from None
+                raise no_room(self.device, CHUNK_BLOCKS * BLOCK_BYTES) from None
             return False
         return True
 
     def _by_chunk(self, rows: Tensor, are_all: bool) -> Iterator[tuple[int, Tensor, Voxels]]:
         """First row, those of the sorted `rows`, and voxels, of each chunk."""
-        starts = list(range(0, len(self.chunks) * CHUNK + 1, CHUNK))
+        starts = list(range(0, len(self.chunks) * CHUNK_BLOCKS + 1, CHUNK_BLOCKS))
         if not are_all:
             starts = torch.searchsorted(rows, torch.tensor(starts).to(rows)).tolist()
         for at, chunk in enumerate(self.chunks):
-            yield at * CHUNK, rows[starts[at] : starts[at + 1]], chunk
+            yield at * CHUNK_BLOCKS, rows[starts[at] : starts[at + 1]], chunk
 
     def _uploaded(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(values).to(self.device)
 
 
-def view_of(lattice: Lattice, camera: Camera) -> View:
+def view_of(lattice: Lattice, camera: Camera) -> GridView:
     """A camera above a lattice, computed as on the CPU."""
     pose = camera.world_to_camera.cpu()
     turn, shift = pose[:3, :3].flatten().tolist(), pose[:3, 3].tolist()
-    side = lattice.voxel * SIDE
+    side = lattice.voxel * BLOCK_SIDE_VOXELS
     per_block, eye = 1 / side, [0.0] * 3
     for axis in range(3):
         for row in range(3):
             eye[axis] -= turn[3 * row + axis] * shift[row] * per_block
     last = (edge - 1 for edge in lattice.high)
-    reach = REACH * lattice.voxel * per_block
+    reach = BLOCK_REACH_VOXELS * lattice.voxel * per_block
     size, lens = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
     groups = turn, shift, eye, side, per_block, reach, lattice.low, last, size, lens, lattice.lengths
-    fields = zip(View._fields_, groups, strict=True)
-    return View(*(value if isinstance(value, float) else kind(*value) for (_, kind), value in fields))
+    fields = zip(GridView._fields_, groups, strict=True)
+    return GridView(*(value if isinstance(value, float) else kind(*value) for (_, kind), value in fields))
 
 
 def most_blocks(device: torch.device) -> int:
@@ -169,9 +186,9 @@ def most_blocks(device: torch.device) -> int:
     """
     free = torch.cuda.mem_get_info(device)[0]
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch's own, and unused
-    blocks = int(SHARE * free / BLOCK_BYTES)
-    if blocks < CHUNK:
-        raise no_room(device, CHUNK * BLOCK_BYTES / SHARE)
+    blocks = int(GRID_MEMORY_SHARE * free / BLOCK_BYTES)
+    if blocks < CHUNK_BLOCKS:
+        raise no_room(device, CHUNK_BLOCKS * BLOCK_BYTES / GRID_MEMORY_SHARE)
     return blocks
 
 

@@ -13,7 +13,7 @@ from surfkit.raster.cuda.rasterizer import TileRasterizer, source
 from surfkit.raster.nvrtc.driver import driver
 from surfkit.raster.nvrtc.modules import Kernels, kernels
 from surfkit.raster.nvrtc.nvrtc import nvrtc
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,6 @@ def _lacks_architecture(device: torch.device) -> str | None:
 
 
 @cache
-def _source(name: str, defines: tuple[tuple[str, int], ...]) -> Source:
+def _source(name: str, defines: tuple[tuple[str, int], ...]) -> CudaSource:
     """One source for each set of defines, so that its kernels are loaded once."""
     return source(name, **dict(defines))

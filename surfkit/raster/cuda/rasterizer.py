@@ -20,26 +20,26 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from surfkit.core.check import BadInput
 from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.nvrtc.modules import Kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.raster.outlook import may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
-HERE = Path(__file__).parent
-TILE, WARPS = 16, 8
+KERNEL_FOLDER = Path(__file__).parent
+TILE_SIDE_PX, WARPS_PER_TILE = 16, 8
 SURFEL, GAUSSIAN, RAY = 0, 1, 2
 RECORD_BYTES = {SURFEL: 192, GAUSSIAN: 128, RAY: 192}
 SUMS = {SURFEL: 20, GAUSSIAN: 16, RAY: 24}
 """Sums over the pixels that each splat gets on the way back; with chosen losses 4 more, of which 2 are used."""
-COLOR, GEOMETRY, DISTORTION = 0, 1, 2
-NOTHING, CHOSEN_COLOR, CHOSEN_ALL, CHOSEN_ABSOLUTE = 0, 1, 2, 3
+LEVEL_COLOR, LEVEL_GEOMETRY, LEVEL_DISTORTION = 0, 1, 2
+CHOSEN_NOTHING, CHOSEN_COLOR, CHOSEN_ALL, CHOSEN_ABSOLUTE = 0, 1, 2, 3
 UPLOADED = WeakTensorKeyDictionary()
 """Of a tensor on the CPU: a device, the version that was copied there, and the copy."""
 NEVER = torch.iinfo(torch.int64).max
 
 
-class View(ctypes.Structure):
-    """`View` of view.h."""
+class RasterView(ctypes.Structure):
+    """`RasterView` of view.h."""
 
     _fields_ = (
         ("pose", ctypes.c_double * 15),  # rotation by columns, translation, and the camera's position
@@ -53,12 +53,12 @@ class View(ctypes.Structure):
     )
 
 
-def _view(splats: Splats, camera: Camera, near: float, rim: float) -> View:
+def _view(splats: Splats, camera: Camera, near: float, rim: float) -> RasterView:
     pose = camera.world_to_camera.double().cpu()
     turn, shift = pose[:3, :3], pose[:3, 3]
     numbers = [*turn.T.flatten().tolist(), *shift.tolist(), *(-turn.T @ shift).tolist()]
     width, height = camera.width, camera.height
-    return View(
+    return RasterView(
         (ctypes.c_double * 15)(*numbers),
         (ctypes.c_double * 5)(camera.fx, camera.fy, camera.cx, camera.cy, near),
         (ctypes.c_int * 2)(width, height),
@@ -66,7 +66,7 @@ def _view(splats: Splats, camera: Camera, near: float, rim: float) -> View:
         splats.antialias,
         GEOMETRIES.index(splats.geometry),
         rim,
-        (ctypes.c_int * 2)(-(-width // TILE), -(-height // TILE)),
+        (ctypes.c_int * 2)(-(-width // TILE_SIDE_PX), -(-height // TILE_SIDE_PX)),
     )
 
 
@@ -75,7 +75,7 @@ def blocks(count: int) -> int:
     return -(-count // 128)
 
 
-class Pass:
+class RasterPass:
     """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn.
 
     Attributes:
@@ -102,7 +102,7 @@ class Pass:
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
         self.coefficients = self.arrays[4].shape[1]
         self.tiles = self.view.tiles[0] * self.view.tiles[1]
-        project = self.program("project", LEVEL=COLOR, CHOSEN=NOTHING, COEFFICIENTS=self.coefficients)
+        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, COEFFICIENTS=self.coefficients)
         touched, depth, slots = self._measure(project, splats)
         self._order(touched, depth)
         self._record(project, slots)
@@ -154,15 +154,15 @@ class Pass:
 
     def words(self) -> int:
         """Words of 32 bits that `forward` notes in which splats are blended where."""
-        return (len(self.entries) // 32 + self.tiles + 1) * WARPS
+        return (len(self.entries) // 32 + self.tiles + 1) * WARPS_PER_TILE
 
 
 class CudaRender(Render):
     """A view drawn by the CUDA kernels, when its maps are first asked for; keeps what the backward needs."""
 
-    def __init__(self, drawn: Pass, made: tuple[str, ...]) -> None:
+    def __init__(self, drawn: RasterPass, made: tuple[str, ...]) -> None:
         self._pass, self._made = drawn, made
-        self._level = {2: COLOR, 5: GEOMETRY, 6: DISTORTION}[len(made)]
+        self._level = {2: LEVEL_COLOR, 5: LEVEL_GEOMETRY, 6: LEVEL_DISTORTION}[len(made)]
         self._size = drawn.view.size[1], drawn.view.size[0]
         self.seen, self.radii = drawn.seen.to(drawn.home), drawn.radii.to(drawn.home)
 
@@ -182,15 +182,17 @@ class CudaRender(Render):
             return one.new_empty(self._size if self._level >= level else 0, dtype=dtype)
 
         self._saved = (
-            plane(COLOR),
-            plane(COLOR, torch.int32),
-            plane(GEOMETRY, torch.int32),
-            *(plane(DISTORTION) for _ in range(3)),
+            plane(LEVEL_COLOR),
+            plane(LEVEL_COLOR, torch.int32),
+            plane(LEVEL_GEOMETRY, torch.int32),
+            *(plane(LEVEL_DISTORTION) for _ in range(3)),
             one.new_zeros(self._pass.words(), dtype=torch.int32),
         )
         outputs = (maps.get(name, none) for name in MAPS)
-        forward = self._pass.program("forward", LEVEL=self._level, CHOSEN=NOTHING)
-        forward.launch("forward", self._pass.tiles, TILE * TILE, *self._pass.lists, *outputs, *self._saved)
+        forward = self._pass.program("forward", LEVEL=self._level, CHOSEN=CHOSEN_NOTHING)
+        forward.launch(
+            "forward", self._pass.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *self._pass.lists, *outputs, *self._saved
+        )
         return maps
 
     def backward(
@@ -205,12 +207,12 @@ class CudaRender(Render):
         sums, touched = arrays[0].new_empty(slots, width), arrays[0].new_zeros(slots, dtype=torch.uint8)
         backward = drawn.program("backward", LEVEL=level, CHOSEN=what, WIDTH=width)
         given = *drawn.lists, drawn.index, rows, *cotangents, *self._saved
-        backward.launch("backward", drawn.tiles, TILE * TILE, *given, sums, touched)
+        backward.launch("backward", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, touched)
         grads = [torch.zeros_like(each[:rows]) for each in arrays]
         signal = arrays[0].new_zeros(rows, 2)
         part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
         program = {"CHOSEN": int(chosen is not None), "WIDTH": width, "COEFFICIENTS": drawn.coefficients}
-        gather = drawn.program("gather", LEVEL=COLOR, **program)
+        gather = drawn.program("gather", LEVEL=LEVEL_COLOR, **program)
         given = *arrays, drawn.view, drawn.index, drawn.first, sums, touched, rows
         gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
         home = drawn.home
@@ -219,13 +221,13 @@ class CudaRender(Render):
     def _levels(self, total: Maps, chosen: Maps | None, absolute: bool) -> tuple[int, int]:
         """Only what has a cotangent costs time."""
         part = (chosen or Maps()).present()
-        names, level = {*total.present(), *part}, COLOR
+        names, level = {*total.present(), *part}, LEVEL_COLOR
         if names & {"depth", "median", "normal"}:
-            level = GEOMETRY
+            level = LEVEL_GEOMETRY
         if "distortion" in names:
-            level = DISTORTION
+            level = LEVEL_DISTORTION
         if chosen is None:
-            return level, NOTHING
+            return level, CHOSEN_NOTHING
         what = CHOSEN_ALL if {*part} - {"color"} else CHOSEN_COLOR
         return level, CHOSEN_ABSOLUTE if absolute else what
 
@@ -262,9 +264,9 @@ class TileRasterizer(Rasterizer):
         one, slots = drawn.arrays[0], len(drawn.entries)
         sums, counts = one.new_zeros(slots), one.new_zeros(slots, dtype=torch.int32)
         total, count = one.new_zeros(len(splats)), one.new_zeros(len(splats), dtype=torch.int64)
-        program = drawn.program("contribution", LEVEL=COLOR, CHOSEN=NOTHING)
+        program = drawn.program("contribution", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING)
         given = *drawn.lists, float(alpha_power), float(transmittance_power)
-        program.launch("contribution", drawn.tiles, TILE * TILE, *given, sums, counts)
+        program.launch("contribution", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, counts)
         program.launch("total", blocks(len(drawn.index)), 128, drawn.index, drawn.first, sums, counts, total, count)
         return total.to(drawn.home), count.to(drawn.home)
 
@@ -278,15 +280,15 @@ class TileRasterizer(Rasterizer):
         x, y, z = at.unbind(1)
         inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         order = inside.nonzero()[:, 0]
-        tile = (y[order].long() // TILE) * drawn.view.tiles[0] + x[order].long() // TILE
+        tile = (y[order].long() // TILE_SIDE_PX) * drawn.view.tiles[0] + x[order].long() // TILE_SIDE_PX
         order = order[tile.argsort(stable=True)]  # threads of a warp read the same list
         opacity = drawn.arrays[0].new_full((len(points),), torch.nan)
-        program = drawn.program("contribution", LEVEL=GEOMETRY, CHOSEN=NOTHING)
+        program = drawn.program("contribution", LEVEL=LEVEL_GEOMETRY, CHOSEN=CHOSEN_NOTHING)
         program.launch("probe", blocks(len(order)), 128, *drawn.lists, at, order, opacity)
         return opacity.to(points.device)
 
-    def _pass(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> Pass:
-        return Pass(self.program, self.where(), splats, camera, near, rim)
+    def _pass(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> RasterPass:
+        return RasterPass(self.program, self.where(), splats, camera, near, rim)
 
 
 def _upload(tensor: Tensor, device: torch.device) -> Tensor:
@@ -306,10 +308,12 @@ def _grey(splats: Splats) -> Splats:
     return replace(splats, sh=splats.sh.new_zeros(len(splats), 1, 3))
 
 
-def source(name: str, **defines: int) -> Source:
+def source(name: str, **defines: int) -> CudaSource:
     """The source of NAME.cu for one kind of splats."""
     record = type(
         "SplatRecord", (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * RECORD_BYTES[defines["KIND"]]),)}
     )
     entry = type("Entry", (ctypes.Structure,), {"_fields_": (("record", ctypes.c_int), ("slot", ctypes.c_int))})
-    return Source(HERE / f"{name}.cu", defines, {"SplatRecord": record, "Entry": entry, "View": View})
+    return CudaSource(
+        KERNEL_FOLDER / f"{name}.cu", defines, {"SplatRecord": record, "Entry": entry, "View": RasterView}
+    )

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
-SOURCE = Source(Path(__file__).with_name("ssim.cu"))
-TILE = (32, 16)
-THREADS = 128
+SSIM_SOURCE = CudaSource(Path(__file__).with_name("ssim.cu"))
+TILE_SIZE_PX = (32, 16)
+THREADS_PER_BLOCK = 128
 
 
 def forward(x: Tensor, y: Tensor, has_gradient: bool, on: Kernels | None = None) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -26,8 +26,8 @@ def forward(x: Tensor, y: Tensor, has_gradient: bool, on: Kernels | None = None)
     grid = _grid(x)
     sums = x.new_empty(grid[0] * grid[1] * grid[2])
     derivatives = tuple(torch.empty_like(x) if has_gradient else x.new_empty(0) for _ in range(3))
-    on = on or kernels(SOURCE, x.device)
-    on.launch("ssim_forward", grid, THREADS, x, y, x.shape[2], x.shape[1], sums, *derivatives)
+    on = on or kernels(SSIM_SOURCE, x.device)
+    on.launch("ssim_forward", grid, THREADS_PER_BLOCK, x, y, x.shape[2], x.shape[1], sums, *derivatives)
     return (sums.sum(dtype=torch.float64) / x.numel()).float(), derivatives
 
 
@@ -37,13 +37,21 @@ def backward(
     """(C, H, W) the gradient by `x` of the mean similarity times `upstream`, a scalar tensor."""
     gradient = torch.empty_like(x)
     sizes = (x.shape[2], x.shape[1])
-    on = on or kernels(SOURCE, x.device)
+    on = on or kernels(SSIM_SOURCE, x.device)
     on.launch(
-        "ssim_backward", _grid(x), THREADS, x, y, *sizes, *derivatives, upstream.reshape(1).contiguous(), gradient
+        "ssim_backward",
+        _grid(x),
+        THREADS_PER_BLOCK,
+        x,
+        y,
+        *sizes,
+        *derivatives,
+        upstream.reshape(1).contiguous(),
+        gradient,
     )
     return gradient
 
 
 def _grid(x: Tensor) -> tuple[int, int, int]:
     channels, height, width = x.shape
-    return (width + TILE[0] - 1) // TILE[0], (height + TILE[1] - 1) // TILE[1], channels
+    return (width + TILE_SIZE_PX[0] - 1) // TILE_SIZE_PX[0], (height + TILE_SIZE_PX[1] - 1) // TILE_SIZE_PX[1], channels

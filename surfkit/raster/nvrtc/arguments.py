@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.raster.nvrtc.source import SCALARS, Kernel, Parameter, Source
+from surfkit.raster.nvrtc.source import SCALAR_TYPES, CudaSource, Kernel, Parameter
 
 Size = int | Sequence[int]
 """Of a grid or block: x, or (x, y), or (x, y, z)."""
@@ -71,7 +71,7 @@ class Signature:
         TypeError: A parameter is of a type that cannot be passed.
     """
 
-    def __init__(self, source: Source, kernel: Kernel, device: torch.device) -> None:
+    def __init__(self, source: CudaSource, kernel: Kernel, device: torch.device) -> None:
         self.kernel = kernel
         self._packers = [_packer(source, kernel, parameter, device) for parameter in kernel.parameters]
 
@@ -101,7 +101,7 @@ class Signature:
         return grid, block
 
 
-def signatures(source: Source, device: torch.device) -> dict[str, Signature]:
+def signatures(source: CudaSource, device: torch.device) -> dict[str, Signature]:
     """That of each kernel, by its name."""
     return {name: Signature(source, kernel, device) for name, kernel in source.kernels.items()}
 
@@ -110,7 +110,7 @@ def _three(size: Size) -> tuple[int, int, int]:
     return (*((size,) if isinstance(size, int) else size), 1, 1)[:3]
 
 
-def _packer(source: Source, kernel: Kernel, parameter: Parameter, device: torch.device) -> Callable[[Any], Any]:
+def _packer(source: CudaSource, kernel: Kernel, parameter: Parameter, device: torch.device) -> Callable[[Any], Any]:
     where = f"kernel {kernel.name}, {parameter.name}"
     structure = source.structures.get(parameter.type)
     if parameter.is_buffer:
@@ -124,9 +124,9 @@ def _packer(source: Source, kernel: Kernel, parameter: Parameter, device: torch.
         return _buffer_packer(where, elements, device)
     if structure:
         return _structure_packer(where, structure)
-    if parameter.type not in SCALARS:
+    if parameter.type not in SCALAR_TYPES:
         raise TypeError(
-            f"{where}: {parameter.type} is no type of values; known are {', '.join(SCALARS)} and structures"
+            f"{where}: {parameter.type} is no type of values; known are {', '.join(SCALAR_TYPES)} and structures"
         )
     return _number_packer(where, parameter.type)
 
@@ -162,7 +162,7 @@ def _structure_packer(where: str, structure: type[ctypes.Structure]) -> Callable
 
 
 def _number_packer(where: str, name: str) -> Callable[[Any], Any]:
-    number = SCALARS[name]
+    number = SCALAR_TYPES[name]
     wanted = {ctypes.c_bool: bool, ctypes.c_float: (int, float), ctypes.c_double: (int, float)}.get(number, int)
 
     def pack(value: Any) -> Any:

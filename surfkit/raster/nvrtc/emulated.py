@@ -19,7 +19,7 @@ import torch
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc.arguments import BufferArgument, Size, signatures
-from surfkit.raster.nvrtc.source import HERE, Kernel, Source
+from surfkit.raster.nvrtc.source import CUDA_FOLDER, CudaSource, Kernel
 
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-w")
 """Hidden, because libraries of several sources, each with its own machine, are loaded into one process."""
@@ -42,7 +42,7 @@ class KernelError(RuntimeError):
     """A kernel did what it must not; says which thread, where, and what."""
 
 
-class Work(ctypes.Structure):
+class LaunchStats(ctypes.Structure):
     """What a launch did, as far as memory and meetings go: from it follows what it costs a GPU at least.
 
     Attributes:
@@ -74,14 +74,16 @@ class Emulated:
 
     def __init__(
         self,
-        source: Source,
+        source: CudaSource,
         seed: int = 0,
         flags: Sequence[str] = (),
         device: torch.device = torch.device("cpu"),  # noqa: B008 (immutable)
     ) -> None:
-        self.source, self.seed, self.device, self.work = source, seed, device, Work()
+        self.source, self.seed, self.device, self.work = source, seed, device, LaunchStats()
         self._signatures = signatures(source, self.device)
-        self._library = _library(_with_tail(source), source.path.stem, (*FLAGS, "-DEMULATED", f"-I{HERE}", *flags))
+        self._library = _library(
+            _with_tail(source), source.path.stem, (*FLAGS, "-DEMULATED", f"-I{CUDA_FOLDER}", *flags)
+        )
         for kernel in source.kernels.values():
             self._check_structures(kernel)
 
@@ -155,7 +157,7 @@ def compiler() -> str:
     )
 
 
-def _with_tail(source: Source) -> str:
+def _with_tail(source: CudaSource) -> str:
     """The text of a source, and behind it how to call each of its kernels."""
     kernels = source.kernels.values()
     calls = [[kernel.name, *(f'"{parameter.name}"' for parameter in kernel.parameters)] for kernel in kernels]
@@ -166,7 +168,7 @@ def _with_tail(source: Source) -> str:
 def _library(text: str, name: str, flags: Sequence[str]) -> ctypes.CDLL:
     """The library of a source, loaded once per process and compiled once per user."""
     key = sha256(repr((text, flags, compiler())).encode())
-    for header in sorted((HERE / "emulator").iterdir()):
+    for header in sorted((CUDA_FOLDER / "emulator").iterdir()):
         key.update(header.read_bytes())
     path = cache_root() / "cuda" / f"{name}-emulated-{key.hexdigest()[:24]}.so"
     if not path.exists():

@@ -11,7 +11,7 @@ from surfkit.raster.nvrtc.arguments import Size, signatures
 from surfkit.raster.nvrtc.driver import Driver, driver
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.nvrtc.nvrtc import image, nvrtc
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 
 class Kernels(Protocol):
@@ -36,7 +36,7 @@ class Kernels(Protocol):
 class Compiled:
     """Kernels on a GPU, compiled for it by NVRTC at first use, then taken from the user's cache."""
 
-    def __init__(self, source: Source, device: torch.device, backend: Driver | None = None) -> None:
+    def __init__(self, source: CudaSource, device: torch.device, backend: Driver | None = None) -> None:
         self.source, self.device = source, device
         self._driver = backend or driver(device)
         architecture = nvrtc().architecture(self._driver.capability)
@@ -53,7 +53,7 @@ class Compiled:
             self._driver.launch(self._functions[name], grid, block, packed)
 
 
-def kernels(source: Source, device: torch.device) -> Kernels:
+def kernels(source: CudaSource, device: torch.device) -> Kernels:
     """The kernels of a source for a device, loaded once per process: a GPU's, or the emulator's for the CPU.
 
     Raises:
@@ -65,5 +65,5 @@ def kernels(source: Source, device: torch.device) -> Kernels:
 
 
 @cache
-def _loaded(source: Source, device: torch.device) -> Kernels:
+def _loaded(source: CudaSource, device: torch.device) -> Kernels:
     return Emulated(source) if device.type == "cpu" else Compiled(source, device)

@@ -20,12 +20,12 @@ import torch
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
-OPTIONS = ("--std=c++17", "--device-as-default-execution-space", "--ptxas-options=-v")
-SEPARATE = "--fmad=false"
+COMPILER_OPTIONS = ("--std=c++17", "--device-as-default-execution-space", "--ptxas-options=-v")
+SEPARATE_ROUNDING_OPTION = "--fmad=false"
 """Of sources whose products and sums are each rounded."""
-OLDEST = 70
+MIN_COMPUTE_CAPABILITY = 70
 """Least compute capability, times ten: before it, the threads of a warp could not go separate ways."""
 
 
@@ -43,11 +43,11 @@ class Nvrtc:
         self.version: tuple[int, int] = (major.value, minor.value)
         self.architectures: list[int] = sorted(supported)
 
-    def compile(self, source: Source, architecture: str) -> tuple[bytes, str]:
+    def compile(self, source: CudaSource, architecture: str) -> tuple[bytes, str]:
         """The compiled image of a source, and what the compiler says of its kernels.
 
         Args:
-            source: See `Source`.
+            source: See `CudaSource`.
             architecture: sm_90 for a cubin of this compute capability, compute_90 for PTX, which the driver compiles.
 
         Raises:
@@ -75,9 +75,9 @@ class Nvrtc:
             BadInput: The GPU is too old.
         """
         wanted = capability[0] * 10 + capability[1]
-        fitting = [a for a in self.architectures if OLDEST <= a <= wanted]
+        fitting = [a for a in self.architectures if MIN_COMPUTE_CAPABILITY <= a <= wanted]
         if not fitting:
-            known = f"{max(self.architectures[0], OLDEST) / 10:.1f}"
+            known = f"{max(self.architectures[0], MIN_COMPUTE_CAPABILITY) / 10:.1f}"
             raise BadInput(
                 f"the GPU has compute capability {wanted / 10:.1f}; surfkit with CUDA {self.version[0]} "
                 f"needs {known} or newer; use --device cpu, or, from 7.0 on, a build of torch for CUDA 12"
@@ -112,7 +112,7 @@ def nvrtc() -> Nvrtc:
     raise BadInput(f"found no NVRTC, NVIDIA's run-time compiler{f' {major}' if major else ''}; pip install {package}")
 
 
-def image(source: Source, architecture: str, driver_version: int = 0) -> bytes:
+def image(source: CudaSource, architecture: str, driver_version: int = 0) -> bytes:
     """What `Nvrtc.compile` gives, from the user's cache if it was compiled before."""
     compiler = nvrtc()
     made_by = compiler.version, architecture, architecture.startswith("compute") and driver_version
@@ -127,8 +127,8 @@ def image(source: Source, architecture: str, driver_version: int = 0) -> bytes:
     return made
 
 
-def _options(source: Source) -> tuple[str, ...]:
-    return (*OPTIONS, SEPARATE) if source.is_exact else OPTIONS
+def _options(source: CudaSource) -> tuple[str, ...]:
+    return (*COMPILER_OPTIONS, SEPARATE_ROUNDING_OPTION) if source.is_exact else COMPILER_OPTIONS
 
 
 def resources(log: str) -> dict[str, dict[str, int]]:

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-HERE = Path(__file__).parent
-PRELUDE = HERE / "prelude.h"
+CUDA_FOLDER = Path(__file__).parent
+PRELUDE = CUDA_FOLDER / "prelude.h"
 
-SCALARS: Mapping[str, type] = {
+SCALAR_TYPES: Mapping[str, type] = {
     "bool": ctypes.c_bool,
     "int": ctypes.c_int,
     "unsigned": ctypes.c_uint,
@@ -50,7 +50,7 @@ class Kernel:
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class CudaSource:
     """A CUDA source and what is defined for it.
 
     Attributes:
@@ -90,7 +90,7 @@ def _resolved(path: Path, seen: set[Path]) -> str:
 
     def include(match: re.Match) -> str:
         target = path.parent / match[1]
-        if HERE / "emulator" in target.resolve().parents:
+        if CUDA_FOLDER / "emulator" in target.resolve().parents:
             return match[0]  # for C++ compilers only, which find it themselves
         line = text.count("\n", 0, match.start()) + 2
         return f'{_resolved(target, seen)}#line {line} "{path.name}"'

@@ -10,15 +10,15 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.losses.consensus import Consensus
-from surfkit.partition.plan import Block as PlannedBlock
-from surfkit.partition.plan import Plan
+from surfkit.partition.plan import BlockPlan as PlannedBlock
+from surfkit.partition.plan import PartitionPlan
 from surfkit.runs.execute.state import BlockState, read_state, write_state
 from surfkit.runs.folder import Run, RunStage
 from surfkit.runs.recipe import Recipe
 
 
 @dataclass(frozen=True)
-class Record:
+class BlocksRecord:
     """Content of `blocks/plan.json`.
 
     Attributes:
@@ -27,11 +27,11 @@ class Record:
     """
 
     coarse_steps: int
-    plan: Plan
+    plan: PartitionPlan
 
 
 @dataclass(eq=False)
-class Block:
+class BlockRun:
     """One block of a run, for the process that trains it or waits for it.
 
     `state` is read once and changed with `write`. Whoever waits for another process to change it calls `read`.
@@ -44,7 +44,7 @@ class Block:
     """
 
     run: Run
-    plan: Plan
+    plan: PartitionPlan
     index: int
     state: BlockState = field(init=False)
     _writing: threading.Lock = field(default_factory=threading.Lock, init=False, repr=False)
@@ -106,7 +106,7 @@ class Block:
             self.state = write_state(self.folder, self.state, **changes)
 
 
-def read_plan(run: Run) -> Record:
+def read_plan(run: Run) -> BlocksRecord:
     """The plan of a run.
 
     Raises:
@@ -115,7 +115,7 @@ def read_plan(run: Run) -> Record:
     path = plan_file(run)
     if not path.exists():
         raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
-    return read_json(path, Record)
+    return read_json(path, BlocksRecord)
 
 
 def plan_file(run: Run) -> Path:
@@ -138,12 +138,12 @@ def rounds_agreed(run: Run) -> int:
     return max((int(path.stem) for path in agreement_file(run, 0).parent.glob("[0-9]*.safetensors")), default=0)
 
 
-def load_blocks(run: Run, plan: Plan) -> list[Block]:
+def load_blocks(run: Run, plan: PartitionPlan) -> list[BlockRun]:
     """All blocks of a plan, with their states as they are now."""
-    return [Block(run, plan, index) for index in range(len(plan.blocks))]
+    return [BlockRun(run, plan, index) for index in range(len(plan.blocks))]
 
 
-def unfinished(blocks: Sequence[Block]) -> list[Block]:
+def unfinished(blocks: Sequence[BlockRun]) -> list[BlockRun]:
     """The blocks that still have steps to do."""
     return [block for block in blocks if not block.is_done]
 

@@ -21,8 +21,8 @@ from surfkit.runs.blocks.eta import describe_progress, seconds_elapsed, seconds_
 from surfkit.runs.execute.state import BlockState, read_state
 from surfkit.train.progress import larger
 
-DRAW_EVERY_S = 1.0
-PLAIN_EVERY_S = 30.0
+BOARD_EVERY_S = 1.0
+BOARD_LINE_EVERY_S = 30.0
 """Between two lines where there is no terminal to draw on."""
 
 
@@ -94,7 +94,7 @@ class BlockDisplay:
 
     def watch(self) -> None:
         """Show, until it is over."""
-        intervals = DRAW_EVERY_S if self.live or self.outer else PLAIN_EVERY_S
+        intervals = BOARD_EVERY_S if self.live or self.outer else BOARD_LINE_EVERY_S
         while not self.over.wait(intervals):
             self.show(self.look())
 

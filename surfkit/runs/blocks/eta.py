@@ -7,7 +7,7 @@ from typing import Protocol
 
 from surfkit.core.clock import clock
 
-LEAST_S = 3.0
+MIN_MEASURED_S = 3.0
 """The first steps are slower than the others."""
 
 
@@ -30,7 +30,7 @@ def seconds_elapsed(block: TimedBlock) -> float | None:
 def steps_per_second(block: TimedBlock) -> float | None:
     """Steps per second since the last start; None if there are too few steps yet."""
     seconds, made = seconds_elapsed(block) or 0.0, block.step - block.first
-    return made / seconds if made > 0 and (seconds > LEAST_S or block.status == "done" and seconds > 0) else None
+    return made / seconds if made > 0 and (seconds > MIN_MEASURED_S or block.status == "done" and seconds > 0) else None
 
 
 def seconds_left(block: TimedBlock) -> float | None:

@@ -11,19 +11,19 @@ from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.core.events import Warned, emit, say
 from surfkit.core.memory import size
-from surfkit.runs.blocks.block import Block
+from surfkit.runs.blocks.block import BlockRun
 from surfkit.runs.folder import read_record
 from surfkit.scene.memory import free_bytes
-from surfkit.train.streaming import Stored
+from surfkit.train.streaming import StoredState
 
-KEPT = 2
+CHECKPOINTS_PER_BLOCK = 2
 """Checkpoints of a block that are kept."""
-GROWN = 3.0
+DENSIFIED_GROWTH = 3.0
 """Growth of the number of points of a block with densification, as a factor; a rule of thumb."""
-POINT_BYTES, FROZEN_BYTES = 3_000, 1_500
+TRAINED_POINT_BYTES, FROZEN_POINT_BYTES = 3_000, 1_500
 """Memory of a point: with parameters, moments, gradients and buffers of the rasterizer; and of a frozen one, without
 moments and gradients. Measured at 1,640 and 770 for each additional point; about as much again is for tiles."""
-FROZEN_PACE = 0.75
+FROZEN_TIME_SHARE = 0.75
 """Time of a frozen point in a step, as a share of that of another (measured: 0.78 ms to 1.03 ms for 1,000 points)."""
 
 
@@ -69,10 +69,12 @@ class BlockPoints:
     @property
     def pace(self) -> float:
         """The time of a step as a share of its time if no point were frozen."""
-        return (self.growing + (FROZEN_PACE if self.frozen else 1) * self.still) / max(1, self.growing + self.still)
+        return (self.growing + (FROZEN_TIME_SHARE if self.frozen else 1) * self.still) / max(
+            1, self.growing + self.still
+        )
 
 
-def initial_points(block: Block) -> BlockPoints:
+def initial_points(block: BlockRun) -> BlockPoints:
     """The points that a block begins with, by its plan; by its state, if it has been started."""
     planned, context, known = block.planned, block.run.recipe.context, block.state.begun_points
     around = max(0, planned.begins - planned.points)
@@ -84,13 +86,13 @@ def initial_points(block: Block) -> BlockPoints:
     return BlockPoints(planned.points, max(0, both - planned.points), False)
 
 
-def point_memory(block: Block) -> int:
+def point_memory(block: BlockRun) -> int:
     """Bytes of memory that the points of a block may need."""
-    grown = GROWN if block.run.recipe.tune.densify is not None else 1.0
-    return initial_points(block).bytes(POINT_BYTES, FROZEN_BYTES, grown)
+    grown = DENSIFIED_GROWTH if block.run.recipe.tune.densify is not None else 1.0
+    return initial_points(block).bytes(TRAINED_POINT_BYTES, FROZEN_POINT_BYTES, grown)
 
 
-def forecast(blocks: Sequence[Block], coarse: Stored, memory: Sequence[int]) -> Forecast:
+def forecast(blocks: Sequence[BlockRun], coarse: StoredState, memory: Sequence[int]) -> Forecast:
     """What blocks will take.
 
     Args:
@@ -103,15 +105,18 @@ def forecast(blocks: Sequence[Block], coarse: Stored, memory: Sequence[int]) -> 
     whole = coarse.path.stat().st_size
     each = whole / max(1, len(model.points))
     begins, there = [initial_points(block) for block in blocks], [checkpoint_bytes(block) for block in blocks]
-    grown, on_gpu = GROWN if tune.densify is not None else 1.0, gpu_point_bytes(blocks[0].run.out, len(model.points))
+    grown, on_gpu = (
+        DENSIFIED_GROWTH if tune.densify is not None else 1.0,
+        gpu_point_bytes(blocks[0].run.out, len(model.points)),
+    )
     least, most = ([points.bytes(each, each / 3, times) for points in begins] for times in (1.0, grown))
     return Forecast(
         steps=sum(steps),
         seconds=sum(count * points.pace for count, points in zip(steps, begins, strict=True))
         * (model.seconds / max(1, model.index)),
         least_bytes=sum(max(0, size - found) for size, found in zip(least, there, strict=True)),
-        disk_bytes=sum(max(0, KEPT * size - found) for size, found in zip(most, there, strict=True))
-        + int(KEPT * grown * whole),  # of the blocks, and of all when they are merged
+        disk_bytes=sum(max(0, CHECKPOINTS_PER_BLOCK * size - found) for size, found in zip(most, there, strict=True))
+        + int(CHECKPOINTS_PER_BLOCK * grown * whole),  # of the blocks, and of all when they are merged
         memory_bytes=max(memory, default=0),
         gpu_bytes=max(points.bytes(on_gpu, on_gpu / 2, grown) for points in begins),
     )
@@ -123,7 +128,7 @@ def gpu_point_bytes(out: Path, points: int) -> float:
     return (held.get("peak", 0) - held.get("photographs", 0)) / max(1, points)
 
 
-def checkpoint_bytes(block: Block) -> int:
+def checkpoint_bytes(block: BlockRun) -> int:
     """Bytes of the existing checkpoints of a block."""
     folder = block.stage.folder
     return sum(path.stat().st_size for path in folder.glob("*.safetensors")) if folder.exists() else 0

@@ -9,9 +9,9 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.partition.merge import Merge, Pieces, Share
+from surfkit.partition.merge import BlockContribution, Merge, Pieces
 from surfkit.primitives.points import Columns, Points
-from surfkit.runs.blocks.block import Block, consensus_of
+from surfkit.runs.blocks.block import BlockRun, consensus_of
 from surfkit.runs.blocks.oom_retry import reduction
 from surfkit.runs.blocks.rounds import AgreedMerge, finished_piece
 from surfkit.runs.context import RunContext
@@ -19,11 +19,11 @@ from surfkit.train import checkpoint, streaming
 from surfkit.train.image_appearance import fresh_appearances
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
-from surfkit.train.streaming import Stored
-from surfkit.train.views import Order
+from surfkit.train.streaming import StoredState
+from surfkit.train.views import ViewOrder
 
 
-def merge_blocks(ctx: RunContext, blocks: Sequence[Block], coarse: Stored) -> bool:
+def merge_blocks(ctx: RunContext, blocks: Sequence[BlockRun], coarse: StoredState) -> bool:
     """Write all blocks as one state, each point from its owner; where nothing was trained, from the coarse model.
 
     False if a result is not what its state says; that block is to be trained again.
@@ -50,19 +50,19 @@ def merge_blocks(ctx: RunContext, blocks: Sequence[Block], coarse: Stored) -> bo
     return True
 
 
-def finished(stage: Stage, stored: Stored) -> Pieces:
+def finished(stage: Stage, stored: StoredState) -> Pieces:
     """The points of a state as they leave its stage."""
     return lambda: (finished_piece(stage, piece) for piece in stored.pieces())
 
 
-def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Share]) -> StageState:
+def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[BlockContribution]) -> StageState:
     """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
     recipe, points = ctx.run.recipe, sum(share.kept for share in shares)
     like = parts[0].points.params
     params = {
         name: torch.empty(points, *value.shape[1:], dtype=value.dtype, device="meta") for name, value in like.items()
     }
-    order, generator = Order(len(ctx.scene.train)), torch.Generator().manual_seed(recipe.seed)
+    order, generator = ViewOrder(len(ctx.scene.train)), torch.Generator().manual_seed(recipe.seed)
     state = StageState(
         Points(params, {}, {}, shared=shared_mean(parts, shares)), order, generator, index=recipe.tune.steps
     )
@@ -76,7 +76,7 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     return state
 
 
-def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns:
+def shared_mean(parts: Sequence[StageState], shares: Sequence[BlockContribution]) -> Columns:
     """Parameters that belong to no point: their mean over the trained blocks, weighted by the points each gives.
 
     `parts` are the coarse model and the trained blocks, in the order of the shares that the coarse model did not fill.
@@ -94,7 +94,7 @@ def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns
     }
 
 
-def open_result(block: Block, steps: int) -> Stored | None:
+def open_result(block: BlockRun, steps: int) -> StoredState | None:
     """The state of a block after some steps; None, and the block planned again, if it is damaged or has not as many."""
     path = block.stage.checkpoint
     try:
@@ -111,7 +111,7 @@ def open_result(block: Block, steps: int) -> Stored | None:
     return None
 
 
-def write_shares(blocks: Sequence[Block], shares: Sequence[Share]) -> None:
+def write_shares(blocks: Sequence[BlockRun], shares: Sequence[BlockContribution]) -> None:
     """Write merge.json; warn of blocks that were reduced for lack of memory, and of those without views."""
     write_json(blocks[0].run.blocks / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
     for share in shares:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from surfkit.core.events import Warned, emit
 from surfkit.densify.base import Densify
-from surfkit.runs.blocks.block import Block
+from surfkit.runs.blocks.block import BlockRun
 from surfkit.runs.execute.state import BlockState
 from surfkit.runs.folder import RunStage
 from surfkit.train import checkpoint
@@ -53,7 +53,7 @@ def next_fallback(state: BlockState, densify: Densify | None) -> Fallback | None
     return fallback
 
 
-def take_fallback(block: Block) -> None:
+def take_fallback(block: BlockRun) -> None:
     """Use the next fallback if the block ran out of memory when it was last trained, with a warning."""
     state, path = block.state, block.stage.checkpoint
     fallback = next_fallback(state, block.run.recipe.tune.densify) if block.is_out_of_memory else None
@@ -72,7 +72,7 @@ def take_fallback(block: Block) -> None:
     block.write(status="planned", kind=None, error=None, fallback=fallback.number, most_points=most, reduced=reduced)
 
 
-def apply_fallback(block: Block, caches: CacheSettings) -> tuple[RunStage, CacheSettings]:
+def apply_fallback(block: BlockRun, caches: CacheSettings) -> tuple[RunStage, CacheSettings]:
     """The stage of a block and the settings of its caches, as changed by the fallbacks it has used."""
     state, stage = block.state, block.stage
     if state.fallback >= NO_CACHE:

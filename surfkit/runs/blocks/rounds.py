@@ -14,24 +14,24 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.files import replacing
-from surfkit.partition.consensus import Agreement, Copies, agree, columns_after, common, mean_copies
-from surfkit.partition.merge import Share
+from surfkit.partition.consensus import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
+from surfkit.partition.merge import BlockContribution
 from surfkit.primitives.points import Columns
-from surfkit.runs.blocks.block import Block, agreement_file, consensus_of, rounds_agreed
+from surfkit.runs.blocks.block import BlockRun, agreement_file, consensus_of, rounds_agreed
 from surfkit.runs.folder import Run
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
-from surfkit.train.streaming import Stored
+from surfkit.train.streaming import StoredState
 
 ID, ROUND = "id", "consensus.round"
 """Columns of the points of a block: which point of the coarse model each is, and the last round whose agreement it has.
 """
-KEPT = 2
+KEPT_ROUND_FILES = 2
 """Files of rounds that are kept."""
 
 
-def stops(block: Block, done: int) -> Iterator[int]:
+def stops(block: BlockRun, done: int) -> Iterator[int]:
     """The steps at which the block is to stop from step `done` on: ends of rounds, as far as others have come."""
     rule, goal = consensus_of(block.run.recipe), block.goal
     every = rule.every if rule else goal
@@ -39,7 +39,7 @@ def stops(block: Block, done: int) -> Iterator[int]:
         yield min(end, goal)
 
 
-def take_in(block: Block, state: StageState | None) -> StageState | None:
+def take_in(block: BlockRun, state: StageState | None) -> StageState | None:
     """The state with what was agreed on at its step, and saved so; as it is where there is nothing to take in.
 
     Raises:
@@ -57,14 +57,14 @@ def take_in(block: Block, state: StageState | None) -> StageState | None:
             f"block {block.index} goes on after step {state.index}, and {agreement_file(block.run, number)} is gone; "
             f"delete {block.run.blocks} to tune all blocks anew"
         )
-    copies = Copies(stats[ID], state.points.params)
+    copies = PointCopies(stats[ID], state.points.params)
     stats = stats | columns_after(copies, stats, found, rule) | {ROUND: torch.full_like(stats[ID], number)}
     state.points = replace(state.points, stats=stats)
     checkpoint.save(block.stage.checkpoint, state)
     return state
 
 
-def end_round(blocks: Sequence[Block], results: Sequence[Stored]) -> None:
+def end_round(blocks: Sequence[BlockRun], results: Sequence[StoredState]) -> None:
     """Write what the blocks agree on at the end of a round, given their states there."""
     run = blocks[0].run
     rule, number = consensus_of(run.recipe), rounds_agreed(run) + 1
@@ -74,11 +74,11 @@ def end_round(blocks: Sequence[Block], results: Sequence[Stored]) -> None:
     ids = common([stored.column(ID) for stored in results])
     found = agree([copies_of(stored, ids) for stored in results], rule, before, number * rule.every)
     save_agreement(agreement_file(run, number), found)
-    agreement_file(run, number - KEPT).unlink(missing_ok=True)
+    agreement_file(run, number - KEPT_ROUND_FILES).unlink(missing_ok=True)
     say(f"round {number}: blocks agree on {len(found.ids):,} common points after step {number * rule.every:,}")
 
 
-def copies_of(stored: Stored, ids: Tensor) -> Copies:
+def copies_of(stored: StoredState, ids: Tensor) -> PointCopies:
     """Those among some points that a block has, without reading the others all at once."""
     own, parts = stored.column(ID), []
     kept = torch.isin(own, ids)
@@ -87,10 +87,10 @@ def copies_of(stored: Stored, ids: Tensor) -> Copies:
         rows = kept[begin : begin + len(piece.points)]
         begin += len(rows)
         parts.append({name: value[rows] for name, value in piece.points.params.items()})
-    return Copies(own[kept], {name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+    return PointCopies(own[kept], {name: torch.cat([part[name] for part in parts]) for name in parts[0]})
 
 
-def save_agreement(path: Path, found: Agreement) -> None:
+def save_agreement(path: Path, found: ConsensusState) -> None:
     """Write a file."""
     from safetensors.torch import save
 
@@ -100,7 +100,7 @@ def save_agreement(path: Path, found: Agreement) -> None:
         file.write(save(tensors))
 
 
-def load_agreement(run: Run, number: int) -> Agreement | None:
+def load_agreement(run: Run, number: int) -> ConsensusState | None:
     """What was agreed on at the end of a round, counted from 1; None if there is no such file.
 
     Raises:
@@ -118,7 +118,7 @@ def load_agreement(run: Run, number: int) -> Agreement | None:
         raise BadInput(f"{path} is damaged; delete {run.blocks} to tune all blocks anew") from error
     z = {name.removeprefix("z."): value for name, value in tensors.items() if name.startswith("z.")}
     rho = {name: float(tensors[f"rho.{name}"]) for name in z}
-    return Agreement(tensors["ids"], z, rho)
+    return ConsensusState(tensors["ids"], z, rho)
 
 
 def finished_piece(stage: Stage, piece: StageState) -> Columns:
@@ -135,11 +135,11 @@ class AgreedMerge:
         results: Of each block that was trained.
     """
 
-    def __init__(self, blocks: Sequence[Block], coarse: Stored, results: Mapping[int, Stored]) -> None:
+    def __init__(self, blocks: Sequence[BlockRun], coarse: StoredState, results: Mapping[int, StoredState]) -> None:
         self.blocks, self.coarse, self.results = blocks, coarse, results
         self.ids = {index: stored.column(ID) for index, stored in results.items()}
 
-    def shares(self) -> tuple[Share, ...]:
+    def shares(self) -> tuple[BlockContribution, ...]:
         """What each block gives: the points that it owns, of those that it has."""
         kept = [0] * len(self.blocks)
         for piece in self.coarse.pieces():
@@ -147,7 +147,7 @@ class AgreedMerge:
             for block in self.blocks:
                 kept[block.index] += int((owner == block.index).sum())
         return tuple(
-            Share(at, at not in self.ids, len(self.ids[at]) if at in self.ids else count, count)
+            BlockContribution(at, at not in self.ids, len(self.ids[at]) if at in self.ids else count, count)
             for at, count in enumerate(kept)
         )
 
@@ -163,7 +163,7 @@ class AgreedMerge:
                 low, high = torch.searchsorted(own, torch.tensor([int(ids[0]), begin])).tolist()
                 if low < high:
                     there = finished_piece(recipe.tune, self.results[index].rows(low, high))
-                    copies.append(Copies(own[low:high], there))
+                    copies.append(PointCopies(own[low:high], there))
             if copies:
                 means, counts = mean_copies(copies, ids)
                 there = counts > 0

@@ -23,18 +23,32 @@ from surfkit.io.datasets import extract
 from surfkit.io.datasets.depth_prior import alignment
 from surfkit.io.datasets.read import observations
 from surfkit.partition.picture import plan_picture
-from surfkit.partition.plan import Fewest, plan
+from surfkit.partition.plan import BlockMinimums, plan
 from surfkit.raster.select import Device
-from surfkit.runs.blocks.block import Block, Record, load_blocks, plan_file, read_plan, started_folders, unfinished
+from surfkit.runs.blocks.block import (
+    BlockRun,
+    BlocksRecord,
+    load_blocks,
+    plan_file,
+    read_plan,
+    started_folders,
+    unfinished,
+)
 from surfkit.runs.blocks.display import BlockDisplay, BlockProgress, read_state_since
 from surfkit.runs.blocks.forecast import forecast, point_memory, report_forecast
 from surfkit.runs.blocks.merge import merge_blocks, open_result
 from surfkit.runs.blocks.oom_retry import next_fallback
 from surfkit.runs.blocks.rounds import end_round
-from surfkit.runs.blocks.worker import BUSY, FULL, activate_coarse_model, open_coarse_model, train_block
+from surfkit.runs.blocks.worker import (
+    BUSY_STATUS,
+    DISK_FULL_STATUS,
+    activate_coarse_model,
+    open_coarse_model,
+    train_block,
+)
 from surfkit.runs.context import RunContext
 from surfkit.runs.execute.base import LOG, Executor, Inline, Job, JobResult
-from surfkit.runs.execute.remote import POLL_S
+from surfkit.runs.execute.remote import CHILD_POLL_S
 from surfkit.runs.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.runs.folder import Run, discard_results
 from surfkit.runs.notes import prefix_notes, repeat_warnings
@@ -42,17 +56,17 @@ from surfkit.train import checkpoint
 from surfkit.train.data_cache import needs_normals, needs_priors, scale_band
 from surfkit.train.faults import DiskFull
 from surfkit.train.state import StageState
-from surfkit.train.streaming import Stored
+from surfkit.train.streaming import StoredState
 
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """How often a block is started in one command before it counts as failed."""
-PROGRAM_BYTES, PIXEL_BYTES = 400 << 20, 150
+PROGRAM_BYTES, TRAINING_PIXEL_BYTES = 400 << 20, 150
 """Memory of a process beside its points: of the program, and for each pixel of a photograph."""
-LEAVE_S = 20.0
+WORKER_EXIT_S = 20.0
 """Seconds in which the workers of a driver that is gone notice that and end."""
-PATIENCE_S = STALE_S + LEAVE_S
+WORKER_PATIENCE_S = STALE_S + WORKER_EXIT_S
 """Seconds that a worker on another machine waits for an earlier one, whose machine may be lost."""
-ARRIVE_S = 90.0
+FILE_ARRIVAL_S = 90.0
 """Seconds until files written on another machine are visible here."""
 
 
@@ -110,7 +124,7 @@ def tune_blocks(ctx: RunContext, compute: Compute, optimise_partition: Callable[
             return checkpoint.load(run.merged.checkpoint)
 
 
-def load_or_make_plan(ctx: RunContext, coarse: Stored, optimise_partition: Callable[[Run], None]) -> Record:
+def load_or_make_plan(ctx: RunContext, coarse: StoredState, optimise_partition: Callable[[Run], None]) -> BlocksRecord:
     """The plan in the folder, or a new one; blocks of another coarse model are renamed."""
     run, path = ctx.run, plan_file(ctx.run)
     if path.exists():
@@ -130,7 +144,7 @@ def load_or_make_plan(ctx: RunContext, coarse: Stored, optimise_partition: Calla
     return make_plan(ctx, coarse)
 
 
-def make_plan(ctx: RunContext, coarse: Stored) -> Record:
+def make_plan(ctx: RunContext, coarse: StoredState) -> BlocksRecord:
     """Plan the blocks, and write the plan and its picture."""
     recipe, path = ctx.run.recipe, plan_file(ctx.run)
     model = sight = activate_coarse_model(ctx, checkpoint.load(coarse.path))
@@ -138,8 +152,8 @@ def make_plan(ctx: RunContext, coarse: Stored) -> Record:
         sight = activate_coarse_model(replace(ctx, run=other), checkpoint.load(open_coarse_model(other).path))
     if recipe.assign.needs_observations:
         sight = replace(sight, observations=observations(ctx.run.data, ctx.scene))
-    made = plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views), model)
-    record = Record(coarse.state.index, made)
+    made = plan(sight, recipe.partition, recipe.assign, BlockMinimums(recipe.min_views), model)
+    record = BlocksRecord(coarse.state.index, made)
     picture = ctx.run.blocks / "plan.png"
     plan_picture(picture, model, record.plan)
     emit(FileWritten(picture, "picture of the blocks"))
@@ -175,17 +189,17 @@ def await_workers(run: Run) -> None:
     Raises:
         BadInput: One does not end.
     """
-    began, patience = time.monotonic(), LEAVE_S
+    began, patience = time.monotonic(), WORKER_EXIT_S
     while busy := {folder: worker for folder in started_folders(run) if (worker := find_worker(folder))}:
         if any(map(find_remote_worker, busy)):
-            patience = LEAVE_S + STALE_S
+            patience = WORKER_EXIT_S + STALE_S
         if time.monotonic() - began > patience:
             folder, worker = next(iter(busy.items()))
             raise BadInput(f"{folder}: {worker} works on the block; wait for its end, or stop it")
-        time.sleep(POLL_S)
+        time.sleep(CHILD_POLL_S)
 
 
-def train_all(ctx: RunContext, blocks: Sequence[Block], coarse: Stored, compute: Compute) -> None:
+def train_all(ctx: RunContext, blocks: Sequence[BlockRun], coarse: StoredState, compute: Compute) -> None:
     """Train all blocks that are not done, after a forecast of what that takes.
 
     Raises:
@@ -206,7 +220,7 @@ def train_all(ctx: RunContext, blocks: Sequence[Block], coarse: Stored, compute:
         train_waiting(ctx, unfinished(blocks), compute, len(blocks))
 
 
-def extract_views(ctx: RunContext, blocks: Sequence[Block]) -> None:
+def extract_views(ctx: RunContext, blocks: Sequence[BlockRun]) -> None:
     """Write the views of each block into its folder, with the alignment of their depth priors if a loss needs any.
 
     The priors are aligned as those of the whole scene: with the views of a block alone, their scale would differ, and
@@ -221,14 +235,14 @@ def extract_views(ctx: RunContext, blocks: Sequence[Block]) -> None:
         extract.save(block.views_file, extract.of(ctx.scene, block.planned.views, priors))
 
 
-def train_waiting(ctx: RunContext, waiting: list[Block], compute: Compute, total: int) -> None:
+def train_waiting(ctx: RunContext, waiting: list[BlockRun], compute: Compute, total: int) -> None:
     """Train the blocks of a list, of a `total` number; those that fail are tried again.
 
     A block that ran out of memory is tried again when the others have ended, with less, and with no other beside it.
     """
     attempts = {block.index: 0 for block in waiting}
     look = watch_progress(ctx, compute, waiting)
-    failed: dict[Block, str] = {}
+    failed: dict[BlockRun, str] = {}
     while waiting:
         batch = [block for block in waiting if not block.is_out_of_memory]
         batch = batch or (waiting[:1] if (compute.workers.at_once or 1) > 1 else list(waiting))
@@ -243,7 +257,7 @@ def train_waiting(ctx: RunContext, waiting: list[Block], compute: Compute, total
                     say(f"block {block.index} {what}; {look().summary()}")
                     continue
                 reason = record_failure(block, result)
-                if result.status == FULL:
+                if result.status == DISK_FULL_STATUS:
                     raise DiskFull(block.folder, f"block {block.index} {reason}")
                 remedy = choose_remedy(block, result.status, attempts[block.index])
                 emit(Warned(f"block {block.index} {reason}" + (f"; {remedy}" if remedy else "")))
@@ -257,7 +271,7 @@ def train_waiting(ctx: RunContext, waiting: list[Block], compute: Compute, total
         )
 
 
-def describe(failed: Mapping[Block, str]) -> str:
+def describe(failed: Mapping[BlockRun, str]) -> str:
     """The blocks that have failed and why, and what helps those that ran out of memory."""
     parts = [f"block {block.index} {failed[block]}" for block in sorted(failed, key=lambda block: block.index)]
     if any(block.is_out_of_memory for block in failed):
@@ -266,8 +280,8 @@ def describe(failed: Mapping[Block, str]) -> str:
 
 
 def run_jobs(
-    ctx: RunContext, batch: Sequence[Block], compute: Compute, look: Callable[[], BlockProgress]
-) -> Iterator[tuple[Block, JobResult]]:
+    ctx: RunContext, batch: Sequence[BlockRun], compute: Compute, look: Callable[[], BlockProgress]
+) -> Iterator[tuple[BlockRun, JobResult]]:
     """The blocks of a batch as their jobs end, with their states read again; other processes' progress is shown."""
     by_index = {block.index: block for block in batch}
     jobs = [job_of(ctx, block, compute) for block in batch]
@@ -281,18 +295,18 @@ def run_jobs(
             yield block, result
 
 
-def has_arrived(block: Block) -> bool:
+def has_arrived(block: BlockRun) -> bool:
     """Whether a block that is done on some machine is done here, too; a network file system may take a while."""
-    until = time.monotonic() + ARRIVE_S
+    until = time.monotonic() + FILE_ARRIVAL_S
     while not block.is_done:
         if time.monotonic() > until:
             return False
-        time.sleep(POLL_S)
+        time.sleep(CHILD_POLL_S)
         block.read()
     return True
 
 
-def watch_progress(ctx: RunContext, compute: Compute, blocks: Sequence[Block]) -> Callable[[], BlockProgress]:
+def watch_progress(ctx: RunContext, compute: Compute, blocks: Sequence[BlockRun]) -> Callable[[], BlockProgress]:
     """A function that reads the progress which blocks make from now on."""
     since, folders = time.time(), {block.index: block.folder for block in blocks}
 
@@ -303,15 +317,15 @@ def watch_progress(ctx: RunContext, compute: Compute, blocks: Sequence[Block]) -
     return look
 
 
-def choose_remedy(block: Block, status: int, attempts: int) -> str | None:
+def choose_remedy(block: BlockRun, status: int, attempts: int) -> str | None:
     """How a block that failed is tried again, in a few words; None if it is not."""
     if block.is_out_of_memory:
         fallback = next_fallback(block.state, block.run.recipe.tune.densify)
         return f"it is tried again: {fallback.text}" if fallback else None
-    return "it is tried again" if status not in (1, 2) and attempts < ATTEMPTS else None
+    return "it is tried again" if status not in (1, 2) and attempts < MAX_ATTEMPTS else None
 
 
-def record_failure(block: Block, result: JobResult) -> str:
+def record_failure(block: BlockRun, result: JobResult) -> str:
     """The failure of a block in a few words; written into the state of the block, unless its worker has done so."""
     status, kind = result.status, result.kind or "crash"
     if result.why is not None or status == 0:
@@ -323,7 +337,7 @@ def record_failure(block: Block, result: JobResult) -> str:
         error = f"ended by {signal.Signals(-status).name}" + " while memory ran out" * (kind == "oom")
         block.write(status="failed", kind=kind, error=error)
         return f"was {error}"
-    if status == BUSY:
+    if status == BUSY_STATUS:
         return "is worked on by another process"
     if block.state.status != "failed":
         block.write(status="failed", kind=kind, error=f"exit status {status}")
@@ -331,7 +345,7 @@ def record_failure(block: Block, result: JobResult) -> str:
     return f"failed: {block.state.error}"
 
 
-def job_of(ctx: RunContext, block: Block, compute: Compute) -> Job:
+def job_of(ctx: RunContext, block: BlockRun, compute: Compute) -> Job:
     """The job that trains one block."""
     elsewhere = compute.workers.at_once is None
     share = ctx.caches.bytes() // (compute.workers.at_once or 1)
@@ -340,7 +354,7 @@ def job_of(ctx: RunContext, block: Block, compute: Compute) -> Job:
     command += ["--gpu-cache", ctx.caches.gpu]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
     command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
-    command += ["--patience", f"{PATIENCE_S}"] * elsewhere
+    command += ["--patience", f"{WORKER_PATIENCE_S}"] * elsewhere
     pixels = max(view.camera.width * view.camera.height for view in ctx.scene.train)
     names = set(block.planned.views)
     views = [view for view in ctx.scene.train if view.name in names]
@@ -352,6 +366,6 @@ def job_of(ctx: RunContext, block: Block, compute: Compute) -> Job:
         call=lambda: train_block(ctx, block),
         command=tuple(command),
         cost=block.planned.work,
-        memory_bytes=PROGRAM_BYTES + point_memory(block) + PIXEL_BYTES * pixels + cached,
+        memory_bytes=PROGRAM_BYTES + point_memory(block) + TRAINING_PIXEL_BYTES * pixels + cached,
         needs=(ctx.run.data.path, views[0].path),
     )

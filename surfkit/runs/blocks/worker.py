@@ -26,12 +26,12 @@ from surfkit.io.datasets import extract
 from surfkit.partition.base import CoarseModel
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns
-from surfkit.runs.blocks.block import Block, consensus_of
+from surfkit.runs.blocks.block import BlockRun, consensus_of
 from surfkit.runs.blocks.oom_retry import apply_fallback, take_fallback
 from surfkit.runs.blocks.rounds import ID, stops, take_in
 from surfkit.runs.command import train_command
 from surfkit.runs.context import RunContext
-from surfkit.runs.execute.remote import CRASHED, DRIVER, INTERRUPTED, POLL_S
+from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, DRIVER, INTERRUPTED_STATUS
 from surfkit.runs.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.runs.folder import Run, refuse_file
 from surfkit.runs.journal import record_events
@@ -43,15 +43,15 @@ from surfkit.train.data_cache import read_ahead
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.state import StageState
-from surfkit.train.streaming import Stored, open_last
+from surfkit.train.streaming import StoredState, open_last
 
 HEARTBEAT_S = 5.0
 """Seconds between heartbeats of a block."""
-FULL, BUSY = 74, 75
+DISK_FULL_STATUS, BUSY_STATUS = 74, 75
 """Exit statuses beside those of `surfkit train` and of remote jobs: disk full; the block is trained by another."""
 
 
-def train_block(ctx: RunContext, block: Block, patience_s: float = 0.0) -> int:
+def train_block(ctx: RunContext, block: BlockRun, patience_s: float = 0.0) -> int:
     """Train a block and return an exit status; the reason of a failure is printed and saved in the state of the block.
 
     Args:
@@ -63,7 +63,7 @@ def train_block(ctx: RunContext, block: Block, patience_s: float = 0.0) -> int:
     refuse_file(folder)
     block.read()  # or BadInput: a damaged state cannot be changed
     while time.monotonic() < until and find_worker(folder):
-        time.sleep(POLL_S)
+        time.sleep(CHILD_POLL_S)
     try:
         with locked(folder):
             if other := find_remote_worker(folder):
@@ -72,10 +72,10 @@ def train_block(ctx: RunContext, block: Block, patience_s: float = 0.0) -> int:
             return _train_locked(ctx, block)
     except BadInput as error:  # another process trains it, and only that may change the state
         say(f"surfkit: block {block.index}: {error}")
-        return BUSY
+        return BUSY_STATUS
 
 
-def _train_locked(ctx: RunContext, block: Block) -> int:
+def _train_locked(ctx: RunContext, block: BlockRun) -> int:
     sweep(block.folder)
     name, folder = block.stage.title, block.folder
     try:
@@ -87,18 +87,18 @@ def _train_locked(ctx: RunContext, block: Block) -> int:
         say(f"surfkit: {name}: {reason}")
         with suppress(OSError):  # the disk may be full
             block.write(status="failed", kind=kind, error=reason)
-        return 2 if isinstance(error, BadInput) else FULL if isinstance(error, DiskFull) else 1
+        return 2 if isinstance(error, BadInput) else DISK_FULL_STATUS if isinstance(error, DiskFull) else 1
     except KeyboardInterrupt:
         block.write(status="failed", kind="interrupted", error="interrupted")
-        return INTERRUPTED
+        return INTERRUPTED_STATUS
     except Exception as error:
         traceback.print_exc()
         block.write(status="failed", kind="crash", error=f"{type(error).__name__}: {error}")
-        return CRASHED
+        return CRASHED_STATUS
     return 0
 
 
-def take_steps(ctx: RunContext, block: Block) -> None:
+def take_steps(ctx: RunContext, block: BlockRun) -> None:
     """Train a block from its last checkpoint to its end."""
     take_fallback(block)
     stage, caches = apply_fallback(block, ctx.caches)
@@ -119,7 +119,7 @@ def take_steps(ctx: RunContext, block: Block) -> None:
     block.write(status="running", step=done, steps=steps, error=None, kind=None, **begun)
     if done < goal:
         given = read_ahead(ctx.run.data, scene, stage.stage.losses, caches, part.priors)
-        start, frozen = Start(ctx, block, scene.train), None
+        start, frozen = BlockStart(ctx, block, scene.train), None
         if context == "frozen":
             start, frozen = replace(start, part="own"), replace(start, part="around")
         owns = None if context == "densified" else start.owns
@@ -133,14 +133,14 @@ def take_steps(ctx: RunContext, block: Block) -> None:
 
 
 @dataclass(frozen=True)
-class Start:
+class BlockStart:
     """The initial points of a block: those of the coarse model that it owns, and those that its views show.
 
     The latter, its context, are rendered with the block, so that it need not fit what others own; they are not merged.
     """
 
     ctx: RunContext
-    block: Block
+    block: BlockRun
     views: Sequence[View]
     part: Literal["both", "own", "around"] = "both"
 
@@ -172,7 +172,7 @@ class Start:
         return self.block.plan.cells.owner(means) == self.block.index
 
 
-def open_coarse_model(run: Run) -> Stored:
+def open_coarse_model(run: Run) -> StoredState:
     """The coarse model of a run, left on disk."""
     found = open_last(run.pretrain.checkpoint)
     if found is None:
@@ -190,7 +190,7 @@ def activate_coarse_model(ctx: RunContext, coarse: StageState) -> CoarseModel:
 
 
 @contextmanager
-def heartbeats(block: Block) -> Iterator[None]:
+def heartbeats(block: BlockRun) -> Iterator[None]:
     """Within, the state of a block gets heartbeats; a worker whose driver is gone stops as if it were asked to.
 
     Raises:
@@ -215,7 +215,7 @@ def heartbeats(block: Block) -> Iterator[None]:
 class Heartbeat:
     """Saves the step of a block every few seconds, also while photographs are read and no step is made."""
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block: BlockRun) -> None:
         self.block = block
         self.driver = int(os.environ.get(DRIVER, 0))
         self.step: dict[str, int] = {}
@@ -237,7 +237,7 @@ class Heartbeat:
     def repeat(self) -> None:
         """Check for the driver and send heartbeats, until it is over."""
         since = time.monotonic()
-        while not self.over.wait(POLL_S):
+        while not self.over.wait(CHILD_POLL_S):
             if self.is_orphan():
                 self.driver = 0
                 os.kill(os.getpid(), signal.SIGTERM)

@@ -16,7 +16,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.core.signals import terminable
-from surfkit.runs.execute.remote import DRIVER, INTERRUPTED, POLL_S
+from surfkit.runs.execute.remote import CHILD_POLL_S, DRIVER, INTERRUPTED_STATUS
 from surfkit.runs.execute.state import Kind
 from surfkit.scene.memory import free_bytes, oom_kills
 
@@ -115,7 +115,7 @@ class Inline(Executor):
         """See `Executor.run`."""
         for job in jobs:
             status = job.call()
-            if status == INTERRUPTED:
+            if status == INTERRUPTED_STATUS:
                 raise KeyboardInterrupt
             yield JobResult(job, status)
 
@@ -174,7 +174,7 @@ class Pool(Executor):
                         waiting.remove(fits[0])
                         workers.begin(fits[0])
                     yield from workers.ended()
-                    time.sleep(POLL_S)
+                    time.sleep(CHILD_POLL_S)
             finally:
                 workers.stop()
 

@@ -14,7 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.core.signals import terminable
 from surfkit.runs.execute.base import Executor, Job, JobResult, sort_by_cost
-from surfkit.runs.execute.remote import CRASHED, POLL_S, run_remote_job
+from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, run_remote_job
 from surfkit.runs.execute.shared import mark_folder, remote_job
 from surfkit.runs.execute.state import Kind
 
@@ -78,7 +78,7 @@ class Ray(Executor):
             under_way = {task.remote(what[job.index]): job for job in sort_by_cost(jobs)}
             try:
                 while under_way:
-                    for ref in ray.wait(list(under_way), timeout=POLL_S)[0]:
+                    for ref in ray.wait(list(under_way), timeout=CHILD_POLL_S)[0]:
                         yield _ended(ray, ref, under_way.pop(ref))
             finally:
                 _cancel(ray, list(under_way))
@@ -187,7 +187,7 @@ def _ended(ray: ModuleType, ref: Any, job: Job) -> JobResult:
     except ray.exceptions.RayError as error:
         lines = str(error).strip().splitlines()
         why = f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
-        return JobResult(job, CRASHED, f"Ray could not run it: {why}", _kind_of(ray, error))
+        return JobResult(job, CRASHED_STATUS, f"Ray could not run it: {why}", _kind_of(ray, error))
     return JobResult(job, found.status, found.why, found.kind)
 
 

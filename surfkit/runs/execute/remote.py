@@ -23,9 +23,9 @@ from surfkit.scene.memory import oom_kills
 
 DRIVER = "SURFKIT_DRIVER"
 """Environment variable with the process that started a worker; when that process is gone, the worker stops."""
-INTERRUPTED, CRASHED = 130, 70
+INTERRUPTED_STATUS, CRASHED_STATUS = 130, 70
 """Exit statuses: asked to stop; an unexpected error."""
-POLL_S = 0.2
+CHILD_POLL_S = 0.2
 FORWARDED = ("PYTHONPATH", "SURFKIT_PLUGINS", "SURFKIT_MAX_MEGAPIXELS")
 """Environment variables of the driver that decide which code runs, and which photographs are read."""
 WATCHDOG = f"""
@@ -44,7 +44,7 @@ signal.signal(signal.SIGTERM, lambda *_: child.terminate())
 mask(signal.SIG_UNBLOCK, [signal.SIGTERM])
 while True:
     try:
-        status = child.wait({POLL_S})
+        status = child.wait({CHILD_POLL_S})
         break
     except subprocess.TimeoutExpired:
         if agent and os.getppid() != agent:
@@ -61,7 +61,7 @@ With SIGUSR2, Slurm tells every process of a job that its time limit is near; on
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RemoteResult:
     """The end of a remote job.
 
     Attributes:
@@ -103,24 +103,24 @@ class RemoteJob:
     hold_s: float = 0.0
     process: subprocess.Popen[bytes] | None = None
 
-    def __call__(self) -> Outcome:
+    def __call__(self) -> RemoteResult:
         """Run it here and wait for its end; when this process is interrupted, the command saves its state first."""
         host, kills = socket.gethostname(), oom_kills()
         if missing := self.missing():
-            return Outcome(2, host, f"machine {host}: {missing}", "data")
+            return RemoteResult(2, host, f"machine {host}: {missing}", "data")
         with interrupts_noted() as came:
             self.begin()
             try:
                 while self.process.poll() is None and not came:
-                    time.sleep(POLL_S)
+                    time.sleep(CHILD_POLL_S)
             finally:
                 self.stop()
         if came:
             raise KeyboardInterrupt
-        if self.process.returncode == INTERRUPTED:
+        if self.process.returncode == INTERRUPTED_STATUS:
             time.sleep(self.hold_s)
         killed = self.process.returncode == -signal.SIGKILL and oom_kills() > kills
-        return Outcome(self.process.returncode, host, kind="oom" if killed else None)
+        return RemoteResult(self.process.returncode, host, kind="oom" if killed else None)
 
     def missing(self) -> str | None:
         """What this machine lacks to run it, as a message; None if nothing."""
@@ -176,7 +176,7 @@ def interrupts_noted() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def run_remote_job(remote_job: RemoteJob) -> Outcome:
+def run_remote_job(remote_job: RemoteJob) -> RemoteResult:
     """Run a remote job; a function, as Ray needs one.
 
     Ray cancels by a simulated Ctrl-C, which `RemoteJob` sees even where the shell that started Ray ignores it.

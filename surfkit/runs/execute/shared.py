@@ -11,7 +11,7 @@ from pathlib import Path
 from surfkit.runs.execute.base import LOG, Job
 from surfkit.runs.execute.remote import RemoteJob
 
-MARK = ".seen-from-all-"
+MARK_PREFIX = ".seen-from-all-"
 
 
 @contextmanager
@@ -22,9 +22,9 @@ def mark_folder(jobs: Sequence[Job]) -> Iterator[Path]:
     """
     beside = jobs[0].folder.resolve().parent
     beside.mkdir(parents=True, exist_ok=True)
-    for left in beside.glob(f"{MARK}*"):  # of a driver that was killed
+    for left in beside.glob(f"{MARK_PREFIX}*"):  # of a driver that was killed
         left.unlink(missing_ok=True)
-    with tempfile.NamedTemporaryFile(dir=beside, prefix=MARK) as file:
+    with tempfile.NamedTemporaryFile(dir=beside, prefix=MARK_PREFIX) as file:
         yield Path(file.name)
 
 

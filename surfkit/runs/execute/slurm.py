@@ -22,28 +22,37 @@ from surfkit.core.events import say
 from surfkit.core.optional import needed
 from surfkit.core.signals import terminable
 from surfkit.runs.execute.base import Executor, Job, JobResult, sort_by_cost
-from surfkit.runs.execute.remote import CRASHED, POLL_S, RemoteJob
+from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, RemoteJob
 from surfkit.runs.execute.shared import mark_folder, remote_job
 from surfkit.runs.execute.state import Kind, find_worker
 
 SLURM_POLL_S = 1.0
 SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T %r")
 """States and reasons of jobs, also of those that are over."""
-USUAL = ("None", "Priority", "Resources", "BeginTime")
+QUIET_REASONS = ("None", "Priority", "Resources", "BeginTime")
 """Reasons to wait that are not printed."""
 JOBS = "jobs"
 """Folder of what submitit writes, beside the folders of the blocks."""
-ASK_S = 30.0
+QUERY_INTERVAL_S = 30.0
 """Seconds between two queries of Slurm."""
-HOLD_S, LEAVE_S = 120.0, 60.0
+JOB_HOLD_S, CANCEL_TIMEOUT_S = 120.0, 60.0
 """How long a job that was asked to end waits until Slurm ends it, and how long we wait for those that we cancelled."""
-ARRIVE_S = 90.0
+RESULT_ARRIVAL_S = 90.0
 """How long after its end the result of a job may take to be seen here."""
-ALIVE = ("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "COMPLETING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED")
-ALIVE += ("RESIZING", "SIGNALING", "STAGE_OUT", "STOPPED", "SPECIAL_EXIT", "PREEMPTED")
+ALIVE_STATES = (
+    "PENDING",
+    "CONFIGURING",
+    "RUNNING",
+    "SUSPENDED",
+    "COMPLETING",
+    "REQUEUED",
+    "REQUEUE_HOLD",
+    "REQUEUE_FED",
+)
+ALIVE_STATES += ("RESIZING", "SIGNALING", "STAGE_OUT", "STOPPED", "SPECIAL_EXIT", "PREEMPTED")
 """States of jobs that may still come to a result."""
 
-KINDS: dict[tuple[str, ...], Kind] = {
+FAILURE_KINDS: dict[tuple[str, ...], Kind] = {
     ("OUT_OF_MEMORY",): "oom",
     ("NODE_FAIL", "BOOT_FAIL", "gone"): "lost",
     ("CANCELLED",): "interrupted",
@@ -134,13 +143,13 @@ class Slurm(Executor):
                         del waiting[:room]
                         queue.submit(executor, batch, [self._remote_job(job, mark) for job in batch])
                     yield from queue.ended()
-                    time.sleep(POLL_S if self.cluster != "slurm" else SLURM_POLL_S)
+                    time.sleep(CHILD_POLL_S if self.cluster != "slurm" else SLURM_POLL_S)
             finally:
                 queue.cancel()
 
     def _remote_job(self, job: Job, mark: Path) -> RemoteJob:
         if self.cluster == "slurm":
-            return replace(remote_job(job, mark, self.cpus, self.gpus > 0), hold_s=HOLD_S)
+            return replace(remote_job(job, mark, self.cpus, self.gpus > 0), hold_s=JOB_HOLD_S)
         return remote_job(job, mark, min(self.cpus, max(1, len(os.sched_getaffinity(0)) // self._limit)), self.gpus > 0)
 
     def _submitter(self, folder: Path, jobs: Sequence[Job]) -> Any:
@@ -218,15 +227,15 @@ class Queue:
             if handle.paths.result_pickle.exists() if self.cluster == "slurm" else handle.done():
                 del self.jobs[handle]
                 yield _ended(handle, job)
-            elif state and state.split()[0] not in ALIVE and time.monotonic() - since > ARRIVE_S:
+            elif state and state.split()[0] not in ALIVE_STATES and time.monotonic() - since > RESULT_ARRIVAL_S:
                 del self.jobs[handle]
                 why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
                 cancelled = state.startswith("CANCELLED")  # by a person, so it is not tried again
-                yield JobResult(job, 1 if cancelled else CRASHED, why, _kind_of(state))
+                yield JobResult(job, 1 if cancelled else CRASHED_STATUS, why, _kind_of(state))
 
     def ask(self) -> None:
         """Ask Slurm for the states of the jobs; with squeue, as not every cluster keeps accounts of past jobs."""
-        if time.monotonic() - self.asked < ASK_S:
+        if time.monotonic() - self.asked < QUERY_INTERVAL_S:
             return
         self.asked = time.monotonic()
         answer = subprocess.run([*SQUEUE, "--me"], capture_output=True, text=True)
@@ -235,7 +244,7 @@ class Queue:
         found = dict(line.split(maxsplit=1) for line in answer.stdout.splitlines())
         for handle, job in self.jobs.items():
             state, _, reason = found.get(handle.job_id, "gone").partition(" ")
-            state += f" ({reason})" if reason and reason not in USUAL else ""
+            state += f" ({reason})" if reason and reason not in QUIET_REASONS else ""
             if state != self.states.get(handle, ("", 0.0))[0]:
                 self.states[handle] = state, self.asked
                 say(f"block {job.index}: job {handle.job_id} is {state}")
@@ -246,9 +255,9 @@ class Queue:
             say(f"{len(self.jobs)} jobs are cancelled; the same command goes on with their blocks")
         for handle in self.jobs:
             handle.cancel(check=False)
-        until = time.monotonic() + LEAVE_S
+        until = time.monotonic() + CANCEL_TIMEOUT_S
         while time.monotonic() < until and any(find_worker(job.folder) for job in self.jobs.values()):
-            time.sleep(POLL_S)
+            time.sleep(CHILD_POLL_S)
         self.jobs.clear()
 
 
@@ -267,12 +276,12 @@ def _ended(handle: Any, job: Job) -> JobResult:
     lines = [line for line in str(error).splitlines() if line.strip(" -")]
     last = next((line for line in reversed(lines) if "Error" in line), lines[0] if lines else "no log")
     why = f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}"
-    return JobResult(job, CRASHED, why, _kind_of(handle.state))
+    return JobResult(job, CRASHED_STATUS, why, _kind_of(handle.state))
 
 
 def _kind_of(state: str) -> Kind:
     """The kind of failure that a state of a Slurm job without a result means."""
-    for words, kind in KINDS.items():
+    for words, kind in FAILURE_KINDS.items():
         if state.startswith(words):
             return kind
     return "crash"

@@ -9,7 +9,7 @@ from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.stereo import Stereo, points
-from surfkit.primitives.model import NEAR
+from surfkit.primitives.model import DEFAULT_NEAR
 from surfkit.raster.api import Maps
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 
@@ -44,7 +44,7 @@ class StereoFusion(Method):
             views=given.scene.train,
             draw=draw,
             rasterizer=given.rasterizer,
-            near=NEAR,
+            near=DEFAULT_NEAR,
             frame=given.scene.frame,
             budget_bytes=given.budget_bytes,
             generator=given.generator,

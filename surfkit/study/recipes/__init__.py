@@ -8,7 +8,7 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.hooks import hookimpl
 from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import AbsGradient
 from surfkit.densify.trim import Trim
 from surfkit.losses.photometric import L1, SSIM
@@ -49,23 +49,23 @@ SURFELS = Recipe(
 SURFELS_IN_BLOCKS = replace(
     SURFELS,
     about="2DGS in blocks that are tuned separately as those of CityGaussian (2DGS* of the paper of CityGaussianV2)",
-    partition=city.FIRST.partition,
-    tune=replace(SURFELS.pretrain, rates=city.FIRST.tune.rates),
+    partition=city.CITY_FIRST.partition,
+    tune=replace(SURFELS.pretrain, rates=city.CITY_FIRST.tune.rates),
 )
 
-FLAT = Recipe(
+FLAT_GAUSSIANS = Recipe(
     about="3D Gaussians with one axis pinned to almost nothing: between 3dgs and 2dgs",
     primitive=Flat3D(),
     pretrain=Stage(losses={"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency()}),
     mesh=TSDF(),
 )
 
-MIP = Recipe(
+MIP_GAUSSIANS = Recipe(
     about="3DGS with a 3D smoothing and a 2D filter, for views from nearer or further away (Mip-Splatting, 2024)",
     primitive=Gaussian3D(antialias=True, dilation=0.1, smoothing=0.2),
 )
 
-ABSOLUTE = Recipe(
+ABSOLUTE_GAUSSIANS = Recipe(
     about="3DGS that splits by the sizes of the pixels' gradients, which signs do not cancel (AbsGS, Ye et al. 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(signal=AbsGradient(), densify=ADC(split_threshold=4e-4, small=0.001)),
@@ -90,13 +90,16 @@ TRIMMED = Recipe(
 
 # Rates fall by 5 % every 400 of the 5,000 steps of recovery; positions go on at the rate that they ended with.
 LIGHT_RATES = slowing({name: rate.start for name, rate in RATES.items()}, 0.95**12.5) | {"means": LearningRate(1.6e-6)}
-LIGHT = Recipe(
+LIGHT_GAUSSIANS = Recipe(
     about="3DGS, then two thirds of the points dropped, simpler colours, most of them codes (LightGaussian, 2023)",
     primitive=Gaussian3D(),
     refine=(
         PruneAndRecover(
             Stage(
-                5_000, densify=None, prune=(Importance(at=(0,), ratio=0.66, score="significance"),), rates=LIGHT_RATES
+                5_000,
+                densify=None,
+                prune=(PruneByImportance(at=(0,), ratio=0.66, score="significance"),),
+                rates=LIGHT_RATES,
             )
         ),
         DistilSH(Stage(5_000, densify=None, rates=LIGHT_RATES | {"opacities": LearningRate(0.0)})),
@@ -115,22 +118,22 @@ RECIPES = {
     "2dgs": SURFELS,
     "2dgs-blocks": SURFELS_IN_BLOCKS,
     "3dgs": GAUSSIANS,
-    "flat3dgs": FLAT,
-    "mip-splatting": MIP,
-    "absgs": ABSOLUTE,
+    "flat3dgs": FLAT_GAUSSIANS,
+    "mip-splatting": MIP_GAUSSIANS,
+    "absgs": ABSOLUTE_GAUSSIANS,
     "trim2dgs": TRIMMED,
-    "lightgaussian": LIGHT,
+    "lightgaussian": LIGHT_GAUSSIANS,
     "surface": SURFACE,
     "surface-blocks": SURFACE_BLOCKS,
     "surface-short": SURFACE_SHORT,
     "stereo": STEREO,
     "import": IMPORTED,
-    "citygs": city.FIRST,
-    "citygs2-coarse": city.COARSE,
+    "citygs": city.CITY_FIRST,
+    "citygs2-coarse": city.CITY_COARSE,
     "citygs2": city.CITY,
-    "citygs2-short": city.SHORT,
-    "citygs2-s": city.SMALL,
-    "citygs2-t": city.TINY,
+    "citygs2-short": city.CITY_SHORT,
+    "citygs2-s": city.CITY_SMALL,
+    "citygs2-t": city.CITY_TINY,
     "citygs2-residence": city_datasets.RESIDENCE,
     "citygs2-russian": city_datasets.RUSSIAN,
     "citygs2-modern": city_datasets.MODERN,

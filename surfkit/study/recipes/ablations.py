@@ -11,7 +11,7 @@ from dataclasses import replace
 from surfkit.compress.vectree import Vectree
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import LossGradient
 from surfkit.densify.trim import Trim
 from surfkit.losses.consensus import Consensus
@@ -21,20 +21,20 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
 from surfkit.losses.warped_patches import WarpedPatches
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import SSIMDifference
 from surfkit.partition.balanced import Balanced
 from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
-from surfkit.partition.sparse_points import SparsePoints
+from surfkit.partition.sparse_points import SparsePointShare
 from surfkit.partition.square_grid import SquareGrid
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.recipe import Recipe
 from surfkit.start.stereo import StereoStart
 from surfkit.study.ablation import BASELINE, Row, Table
-from surfkit.study.columns import OF_MESH
+from surfkit.study.columns import MESH_COLUMNS
 from surfkit.study.recipes import RECIPES, city, surface
 from surfkit.study.recipes.surface import STEREO
 from surfkit.train.stage import Stage
@@ -79,7 +79,7 @@ def stereo_alone(on: str) -> Row:
 
 # What the second stage of CityGaussianV2 adds to its pretraining. Its losses and its densification are those of
 # pretraining, but for the normal loss, which counts from the beginning.
-PARALLEL = {
+PARALLEL_TUNING = {
     "partition": city.CITY.partition,
     "tune": replace(city.CITY.tune, prune=()),
     "context": city.CITY.context,
@@ -88,7 +88,7 @@ PARALLEL = {
 # In print, "indented rows exclude each other": trim and prune are both added to parallel tuning, and trim is kept. The
 # control is not in print: the same second stage on the whole scene tells what the stage brings, and what the cut does.
 # How many points LightGaussian's pruning drops is not in print: 10.3 of 19.3 million points are left, so half.
-MODEL = Table(
+MODEL_TABLE = Table(
     "model",
     "What each component brings (CityGaussianV2, ablation on model components; published on Residence of GauU-Scene)",
     COARSE_BASELINE,
@@ -119,7 +119,7 @@ MODEL = Table(
         ),
         Row(
             "+ parallel tuning",
-            PARALLEL,
+            PARALLEL_TUNING,
             group="Fine-tuning",
             paper=published(0.742, 23.50, 0.237, 0.538, 0.419, 0.471, millions=19.3, minutes=195)
             | costs(4.57, 31.5, 21.3),
@@ -133,7 +133,7 @@ MODEL = Table(
         ),
         Row(
             "+ prune (LightGaussian)",
-            {"tune.prune": (Importance(at=(15_000,), ratio=0.5),)},
+            {"tune.prune": (PruneByImportance(at=(15_000,), ratio=0.5),)},
             kept=False,
             on="+ parallel tuning",
             paper=published(0.738, 23.46, 0.246, 0.538, 0.420, 0.472, millions=10.3, minutes=168)
@@ -153,7 +153,7 @@ MODEL = Table(
         ),
         Row(
             "+ 7k pretrain (Ours-t)",
-            {"pretrain": city.TINY.pretrain},
+            {"pretrain": city.CITY_TINY.pretrain},
             paper=published(0.721, 23.17, 0.281, 0.517, 0.416, 0.461, millions=5.31, minutes=115)
             | costs(0.29, 11.5, 41.7),
         ),
@@ -179,7 +179,7 @@ MODEL = Table(
 
 # The table in print has the heads of PSNR and SSIM swapped. Its gradients are not scaled, so there is no boost. Leaving
 # a loss out of the gradient is tried on top of all of them; SSIM alone is what the paper goes on with.
-GRADIENT = Table(
+GRADIENT_TABLE = Table(
     "gradient",
     "Which losses should drive densification (CityGaussianV2, ablation on gradient source of densification)",
     COARSE_BASELINE,
@@ -226,11 +226,11 @@ WITHOUT_NORMALS = {name: loss for name, loss in surface.SURFACE.pretrain.losses.
 WITH_SKY = replace(surface.SURFACE.mesh, sky=True)
 PIXEL_MAPS = replace(WITH_SKY, oversampling=1.0)
 PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
-CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=Agreement(alone=0.1))
-SHORT = replace(TSDF(), truncation_voxels=CONFIRMED.truncation_voxels, largest_px=CONFIRMED.largest_px)
+CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=GeometricConsistency(alone=0.1))
+SHORT_TRUNCATION = replace(TSDF(), truncation_voxels=CONFIRMED.truncation_voxels, largest_px=CONFIRMED.largest_px)
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; it has no splats, and so no PSNR.
-SURFACE = Table(
+SURFACE_TABLE = Table(
     "surface",
     "What each part of recipe:surface brings, from 2DGS on sparse points to splats that stay with stereo depth",
     replace(COARSE_BASELINE, mesh=TSDF()),
@@ -240,7 +240,7 @@ SURFACE = Table(
         Row("+ dense start", {"start": StereoStart(), "pretrain.densify": surface.SURFACE.pretrain.densify}),
         Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
         Row("+ no normal consistency", {"pretrain.losses": WITHOUT_NORMALS}),
-        Row("+ shorter truncation, no splats above 64 pixels", {"mesh": SHORT}),
+        Row("+ shorter truncation, no splats above 64 pixels", {"mesh": SHORT_TRUNCATION}),
         Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
@@ -258,12 +258,12 @@ SURFACE = Table(
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
         Row("stereo alone", {"method": STEREO.method}, kept=False),
     ),
-    columns=OF_MESH,
+    columns=MESH_COLUMNS,
 )
 
 # Figures of GauU-Scene, means of three scenes. Plugin packages add the other methods (`surfkit_rows`). Differences are
 # to 2DGS, which the paper starts from.
-METHODS = Table(
+METHODS_TABLE = Table(
     "methods",
     "Whole methods on the same data (CityGaussianV2, comparison with SOTA reconstruction methods, GauU-Scene)",
     RECIPES["2dgs"],
@@ -291,7 +291,7 @@ METHODS = Table(
 )
 
 # The paper trims a fortieth, and on Residence a tenth; its released code a twentieth by another score.
-TRIM = Table(
+TRIM_TABLE = Table(
     "trim",
     "How much is trimmed while blocks are tuned, and by which contribution",
     replace(city.CITY, tune=replace(city.CITY.tune, prune=())),
@@ -309,7 +309,7 @@ TRIM = Table(
 
 # DOGS has its blocks agree once points are neither added nor removed any more.
 STILL = {"tune.densify": None, "tune.prune": ()}
-PARTITION = Table(
+PARTITION_TABLE = Table(
     "partition",
     "How the scene is cut, which views a block gets, and what becomes of the points around it",
     city.CITY,
@@ -322,7 +322,7 @@ PARTITION = Table(
         Row("balanced", {"partition": Balanced(count=4)}, kept=False),
         Row("SSIM threshold 0.1", {"assign": SSIMDifference(threshold=0.1)}, kept=False),
         Row("views by airspace", {"assign": Airspace()}, kept=False),
-        Row("chunks (Hierarchical 3DGS)", {"partition": SquareGrid(), "assign": SparsePoints()}, kept=False),
+        Row("chunks (Hierarchical 3DGS)", {"partition": SquareGrid(), "assign": SparsePointShare()}, kept=False),
         Row("surroundings densified", {"context": "densified"}, kept=False),
         Row("surroundings frozen", {"context": "frozen"}, kept=False),
         Row("blocks add no points", STILL, kept=False),
@@ -331,5 +331,8 @@ PARTITION = Table(
     ),
 )
 
-TABLES = {table.name: table for table in (MODEL, GRADIENT, SURFACE, METHODS, TRIM, PARTITION)}
+TABLES = {
+    table.name: table
+    for table in (MODEL_TABLE, GRADIENT_TABLE, SURFACE_TABLE, METHODS_TABLE, TRIM_TABLE, PARTITION_TABLE)
+}
 """The tables that `surfkit ablate table:NAME` accepts."""

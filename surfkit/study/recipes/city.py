@@ -23,7 +23,7 @@ from surfkit.runs.recipe import Recipe
 from surfkit.train.refine.light import DistilSH, PruneAndRecover
 from surfkit.train.stage import Stage
 
-FILTERS = (Elongation(min_ratio=0.01),)
+ELONGATION_FILTERS = (Elongation(min_ratio=0.01),)
 LOSSES = {
     "l1": L1(),
     "ssim": SSIM(),
@@ -44,23 +44,23 @@ def cut_short(stage: Stage, steps: int) -> Stage:
 
 
 # The upper half of the paper's ablation table, from `recipes.ablations.COARSE_BASELINE` to here.
-COARSE = Recipe(
+CITY_COARSE = Recipe(
     about="Pretraining of CityGaussianV2 (Liu et al. 2024): densified by the gradient of SSIM, depth from priors",
     primitive=Surfel2D(),
     pretrain=Stage(
         losses=LOSSES,
         signal=LossGradient(terms=("ssim",), boost=0.9),
-        densify=ADC(cull_opacity=0.005, filters=FILTERS),
+        densify=ADC(cull_opacity=0.005, filters=ELONGATION_FILTERS),
     ),
     mesh=TSDF(),
 )
 
 CITY = replace(
-    COARSE,
+    CITY_COARSE,
     about="CityGaussianV2 (Liu et al. 2024): pretraining, then blocks tuned separately and trimmed, then merged",
     partition=ContractedGrid(blocks=(2, 2)),
     tune=replace(
-        COARSE.pretrain,
+        CITY_COARSE.pretrain,
         losses=TUNED_LOSSES,
         prune=(Trim(ratio=0.025),),
         rates={"means": LearningRate(6.4e-5, 6.4e-7), "scales": LearningRate(4e-3)},
@@ -72,27 +72,27 @@ CITY = replace(
 )
 
 # After 4,000 steps, blocks at reduced rates lag behind; after 12,000, the two had come to the same.
-SHORT = replace(
+CITY_SHORT = replace(
     CITY,
     about="CityGaussianV2 for runs of a few thousand steps: blocks keep the rates of pretraining and are not trimmed",
     tune=replace(CITY.tune, prune=(), rates={}),
 )
 
-SMALL = replace(
+CITY_SMALL = replace(
     CITY,
     about="CityGaussianV2, small: colours of degree 2, those that matter least as codes, a quarter of the bytes",
     primitive=Surfel2D(sh_degree=2),
     compress=Vectree(),
 )
 
-TINY = replace(
-    SMALL,
+CITY_TINY = replace(
+    CITY_SMALL,
     about="CityGaussianV2, tiny: as small, and the blocks begin from the first 7,000 steps of pretraining",
-    pretrain=cut_short(SMALL.pretrain, 7_000),
+    pretrain=cut_short(CITY_SMALL.pretrain, 7_000),
 )
 
 # The first version: no surface, but the pipeline that the second goes on from.
-FIRST = Recipe(
+CITY_FIRST = Recipe(
     about="CityGaussian (Liu et al. 2024): 3DGS in blocks, half of the points dropped, codes, levels of detail",
     primitive=Gaussian3D(),
     partition=ContractedGrid(blocks=(2, 2)),

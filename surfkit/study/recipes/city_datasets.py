@@ -20,7 +20,7 @@ from surfkit.partition.assign import SSIMDifference
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.recipe import Recipe
-from surfkit.study.recipes.city import CITY, FILTERS, LOSSES, TUNED_LOSSES
+from surfkit.study.recipes.city import CITY, ELONGATION_FILTERS, LOSSES, TUNED_LOSSES
 
 GAUU_MESH = TSDF(voxel=1.0, truncation=4.0, depth_limit=250.0)
 MATRIXCITY_MESH = TSDF(voxel=1.0, truncation=4.0, depth_limit=500.0)
@@ -51,7 +51,7 @@ AERIAL = replace(
     about="CityGaussianV2 for aerial photographs of a whole city, as in MatrixCity: 36 blocks, densified less often",
     pretrain=replace(CITY.pretrain, rates={"means": LearningRate(8e-5, 8e-7), "scales": LearningRate(2.5e-3)}),
     partition=ContractedGrid(blocks=(6, 6)),
-    tune=replace(CITY.tune, densify=ADC(cull_opacity=0.005, every=200, filters=FILTERS)),
+    tune=replace(CITY.tune, densify=ADC(cull_opacity=0.005, every=200, filters=ELONGATION_FILTERS)),
     mesh=MATRIXCITY_MESH,
 )
 
@@ -65,7 +65,7 @@ STREET = replace(
     pretrain=replace(
         CITY.pretrain,
         losses=LOSSES | {"depth": DepthRegression(start=1.0, end=0.1, scale_band=STREET_BAND)},
-        densify=ADC(threshold=5e-5, start=4_000, every=1_000, reset_every=20_000, filters=FILTERS),
+        densify=ADC(threshold=5e-5, start=4_000, every=1_000, reset_every=20_000, filters=ELONGATION_FILTERS),
         rates={"means": LearningRate(1.6e-5, 1.6e-6), "scales": LearningRate(1e-3)},
     ),
     partition=ContractedGrid(blocks=(5, 4)),
@@ -74,7 +74,7 @@ STREET = replace(
         CITY.tune,
         steps=60_000,
         losses=TUNED_LOSSES | {"depth": DepthRegression(start=0.5, end=0.025, scale_band=STREET_BAND)},
-        densify=ADC(threshold=7.5e-5, until=30_000, every=1_000, reset_every=30_000, filters=FILTERS),
+        densify=ADC(threshold=7.5e-5, until=30_000, every=1_000, reset_every=30_000, filters=ELONGATION_FILTERS),
         prune=(),
         rates={"means": LearningRate(8e-6, 8e-7), "scales": LearningRate(2.5e-3)},
     ),
@@ -106,7 +106,7 @@ RELEASED = replace(
         CITY.tune,
         losses=released_depth(CITY, 0.025),
         signal=RELEASED_SIGNAL,
-        densify=ADC(threshold=3e-4, cull_opacity=0.005, filters=FILTERS),
+        densify=ADC(threshold=3e-4, cull_opacity=0.005, filters=ELONGATION_FILTERS),
         prune=(Trim(ratio=0.05, score="released", whole_epochs=False, recovery=0),),
     ),
     context="densified",
@@ -121,7 +121,9 @@ RELEASED_AERIAL = replace(
     tune=replace(
         RELEASED.tune,
         steps=60_000,
-        densify=ADC(cull_opacity=0.005, start=1_000, until=30_000, every=200, reset_every=6_000, filters=FILTERS),
+        densify=ADC(
+            cull_opacity=0.005, start=1_000, until=30_000, every=200, reset_every=6_000, filters=ELONGATION_FILTERS
+        ),
         prune=(Trim(ratio=0.1, score="released", until=30_000, whole_epochs=False, recovery=0),),
     ),
     mesh=MATRIXCITY_MESH,

@@ -11,7 +11,7 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import NormalConsistency
-from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.grid import ContractedGrid
@@ -24,8 +24,8 @@ from surfkit.train.stage import Stage
 
 # Short runs learn more at higher rates than those of 3DGS, with which they end; four times these are too high for
 # boruszyn. Positions have half of theirs: at higher rates points leave the depth of stereo that they begin at.
-RATES = {name: replace(rate, start=2 * rate.start, end=rate.start) for name, rate in columns.RATES.items()}
-RATES["means"] = LearningRate(0.8e-4, 0.8e-6)
+SURFACE_RATES = {name: replace(rate, start=2 * rate.start, end=rate.start) for name, rate in columns.RATES.items()}
+SURFACE_RATES["means"] = LearningRate(0.8e-4, 0.8e-6)
 
 SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
@@ -49,7 +49,7 @@ SURFACE = Recipe(
         # Stereo leaves holes, where few views see or nothing has texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
-        rates=RATES,
+        rates=SURFACE_RATES,
         update="in-view",
     ),
     # Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
@@ -64,7 +64,7 @@ SURFACE = Recipe(
         least_views=0.05,
         largest_px=64.0,
         sky=False,
-        trust=Agreement(alone=0.5, covered_by=2),
+        trust=GeometricConsistency(alone=0.5, covered_by=2),
     ),
 )
 

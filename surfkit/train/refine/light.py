@@ -11,7 +11,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
 from surfkit.core.schedule import LearningRate
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.points import Columns
@@ -34,7 +34,7 @@ STARTS = {name: rate.start for name, rate in RATES.items()}
 RECOVERY = slowing(STARTS | {"scales": 7.5e-5}, 0.95**75) | {"means": LearningRate(3e-7, 3e-9)}
 DISTILLATION = slowing(STARTS | {"scales": 7.5e-5, "opacities": 0.0}, 0.9**20) | {"means": LearningRate(9.5e-9, 3e-9)}
 
-MOST_COPIES = 1000
+MAX_COPIES = 1000
 """Of each camera."""
 
 
@@ -43,7 +43,7 @@ class PruneAndRecover(Refine):
     """Drop the points of least importance, then optimise the others."""
 
     stage: Stage = field(
-        default_factory=lambda: Stage(densify=None, prune=(Importance(at=(0,), ratio=0.5),), rates=RECOVERY)
+        default_factory=lambda: Stage(densify=None, prune=(PruneByImportance(at=(0,), ratio=0.5),), rates=RECOVERY)
     )
     """The optimisation, with what it drops."""
 
@@ -71,8 +71,8 @@ class DistilSH(Refine):
     def __post_init__(self) -> None:
         if self.sh_degree not in range(4):
             raise BadInput(f"distil.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
-        if self.jitter < 0 or not 1 <= self.copies <= MOST_COPIES:
-            raise BadInput(f"distil.jitter {self.jitter}, copies {self.copies}: give 0 or more, and 1 to {MOST_COPIES}")
+        if self.jitter < 0 or not 1 <= self.copies <= MAX_COPIES:
+            raise BadInput(f"distil.jitter {self.jitter}, copies {self.copies}: give 0 or more, and 1 to {MAX_COPIES}")
 
     def primitive(self, primitive: Primitive) -> Primitive:
         """The same with fewer harmonics."""

@@ -11,11 +11,22 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from surfkit.apps.doctor.estimate import Load, Room, advice, duration, estimate, first_look, one_digit
+from surfkit.apps.doctor.estimate import FixedCosts, MachineLimits, advice, duration, estimate, first_look, one_digit
 from surfkit.apps.doctor.examine import examine
-from surfkit.apps.doctor.forecast import Plan, beyond, forecast, schedule, within
+from surfkit.apps.doctor.forecast import ProbePlan, beyond, forecast, schedule, within
 from surfkit.apps.doctor.growth import Growth, growth
-from surfkit.apps.doctor.probe import Job, Part, Probed, Started, Taken, Written, measure, probe, some, with_count
+from surfkit.apps.doctor.probe import (
+    ProbeJob,
+    ProbeOutput,
+    ProbeResult,
+    ProbeSegment,
+    ProbeStart,
+    SegmentCosts,
+    measure,
+    probe,
+    some,
+    with_count,
+)
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import size
 from surfkit.core.tree import evolve
@@ -27,16 +38,16 @@ from surfkit.losses import NormalPrior, Reprojection
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.runs.pipeline import Intervals, run, with_steps
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.study.recipes.surface import SURFACE
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.trainer import Trainer
 
-STARTED = Started(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
-WRITTEN = Written(700.0, 250.0, 10_000, 1.0, 5.0, 2_000_000_000)
-ROOM = Room(10**12, 10**12, 10**12)
-LOAD = Load(
+STARTED = ProbeStart(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
+WRITTEN = ProbeOutput(700.0, 250.0, 10_000, 1.0, 5.0, 2_000_000_000)
+ROOM = MachineLimits(10**12, 10**12, 10**12)
+LOAD = FixedCosts(
     steps=1_000,
     train=100,
     held_out=10,
@@ -62,12 +73,12 @@ def farm(tmp_path_factory):
 
 
 def probed(points=(1_000_000, 2_000_000), seconds=(1.0, 1.5), peaks=(3_000_000_000, 5_000_000_000)):
-    taken = tuple(map(Taken, points, seconds, peaks))
-    return Probed(STARTED, taken, replace(WRITTEN, peak_bytes=max(peaks)))
+    taken = tuple(map(SegmentCosts, points, seconds, peaks))
+    return ProbeResult(STARTED, taken, replace(WRITTEN, peak_bytes=max(peaks)))
 
 
 def parts(*points):
-    return tuple(Part(at, count, 1 / len(points)) for at, count in enumerate(points))
+    return tuple(ProbeSegment(at, count, 1 / len(points)) for at, count in enumerate(points))
 
 
 def rising(last, known=True):
@@ -116,7 +127,7 @@ def test_what_to_lower_where_memory_is_short(memory, words):
 
 def test_what_to_lower_where_disk_or_time_is_short():
     load = replace(LOAD, steps=10**6, undistort=10, undistort_bytes=1e6)
-    room = Room(10**12, 10**6, 10**7)
+    room = MachineLimits(10**12, 10**6, 10**7)
     found = estimate(load, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), room)
     assert [finding.what for finding in advice(found)] == ["run-folder-disk", "undistorted-disk", "time"]
 
@@ -177,7 +188,7 @@ def test_points_become_as_many_as_wanted(farm):
 def tiny(farm, tmp_path):
     scene = read(Data(farm, test_every=0))
     recipe = with_steps(evolve(recipes()["citygs2-coarse"], "primitive.sh_degree", 1), 400)
-    return Job(recipe, some(scene, scene.train[:3]), parts(300, 900), 8, 60.0, True)
+    return ProbeJob(recipe, some(scene, scene.train[:3]), parts(300, 900), 8, 60.0, True)
 
 
 def test_what_a_probe_measures(farm, tmp_path):
@@ -244,7 +255,7 @@ def test_a_probe_that_is_killed_says_so(farm, tmp_path, forked_probe):
 
     found = probe(job, kill)
     assert found.written is None and "killed" in found.failure
-    empty = Cloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    empty = SparsePoints(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
     broken = probe(replace(job, scene=replace(job.scene, cloud=empty)))
     assert "BadInput: the scene has no sparse points" in broken.failure and broken.taken == ()
 
@@ -268,11 +279,11 @@ def test_a_probe_that_is_killed_says_so(farm, tmp_path, forked_probe):
     ],
 )
 def test_what_it_means_that_a_probe_ended_early(farm, monkeypatch, taken, failure, level, words):
-    broken = Probed(STARTED, probed().taken[:taken], None, failure)
+    broken = ProbeResult(STARTED, probed().taken[:taken], None, failure)
     monkeypatch.setattr("surfkit.apps.doctor.forecast.probe", lambda job, told: broken)
     monkeypatch.setattr("surfkit.apps.doctor.forecast.schedule", lambda *_: parts(300, 900, 900, 900, 900))
     data, recipe = Data(farm, test_every=0), recipes()["2dgs"]
-    found, (finding,) = forecast(data, recipe, examine(data, recipe, quick=True), Plan())
+    found, (finding,) = forecast(data, recipe, examine(data, recipe, quick=True), ProbePlan())
     assert found is None and finding.level == level and finding.text.startswith(words)
 
 
@@ -284,7 +295,7 @@ def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path, forke
     before = {path for path in farm.rglob("*")}
     heard = []
     examined = examine(data, recipe)
-    found, findings = forecast(data, recipe, examined, Plan(10, out=out), lambda *words: heard.append(words))
+    found, findings = forecast(data, recipe, examined, ProbePlan(10, out=out), lambda *words: heard.append(words))
     assert {path for path in farm.rglob("*")} == before and not out.exists()
     assert findings == [] and heard[-1][0] == "probe" and heard[-1][1] == heard[-1][2]
     assert found.points == 300 and found.points_known and found.seconds > 0
@@ -293,7 +304,7 @@ def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path, forke
     assert 0.75 * real < found.run_bytes < 1.25 * real
     undistorted = sum(path.stat().st_size for path in (farm / "undistorted").iterdir())
     assert 0.8 * undistorted < found.data_bytes < 1.2 * undistorted
-    again, _ = forecast(data, recipe, examined, Plan(10, out=out))
+    again, _ = forecast(data, recipe, examined, ProbePlan(10, out=out))
     assert again.data_bytes == 0  # they are there now
 
 
@@ -306,7 +317,7 @@ def test_the_memory_of_a_gpu_is_measured_and_added_up(farm, monkeypatch, tmp_pat
         gpu.limit = 10**9
         started, *taken, _ = measure(job)
         assert 0.9e9 < started.gpu_free_bytes <= 1e9 and taken[-1].gpu_bytes <= gpu.peak
-    found = estimate(LOAD, parts(200, 300, 600), rising(10**6), Probed(started, tuple(taken), WRITTEN), ROOM).gpu
+    found = estimate(LOAD, parts(200, 300, 600), rising(10**6), ProbeResult(started, tuple(taken), WRITTEN), ROOM).gpu
     columns = 3 * 4 * (3 + 2 + 4 + 1 + 4 * 3)  # parameters and moments, each of them float32
     assert columns < found.point_bytes < 10 * columns
     assert found.memory_bytes - found.cache_bytes == pytest.approx(10**6 * found.point_bytes, rel=0.2)
@@ -321,9 +332,9 @@ def test_the_memory_of_a_gpu_is_measured_and_added_up(farm, monkeypatch, tmp_pat
     ],
 )
 def test_what_to_lower_where_a_gpu_is_small(free, words):
-    taken = (Taken(1_000_000, 0.5, 10**9, 4 * 10**9), Taken(2_000_000, 0.5, 10**9, 8 * 10**9))
+    taken = (SegmentCosts(1_000_000, 0.5, 10**9, 4 * 10**9), SegmentCosts(2_000_000, 0.5, 10**9, 8 * 10**9))
     started = replace(STARTED, gpu_free_bytes=free)
-    found = estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), Probed(started, taken, WRITTEN), ROOM)
+    found = estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), ProbeResult(started, taken, WRITTEN), ROOM)
     assert found.gpu.memory_bytes == 8 * 10**9 + min(LOAD.view_bytes, free // 4)
     assert [finding.what for finding in advice(found)] == ["gpu-memory"] * (words is not None)
     assert words is None or words in advice(found)[0].text and "filters.0.points 1000000" in advice(found)[0].text

@@ -8,11 +8,11 @@ import pytest
 from surfkit.apps.doctor.exposure import exposures, luminance
 from surfkit.apps.doctor.geometry import places
 from surfkit.apps.doctor.holes import holes
-from surfkit.io.datasets.capture import Shot, load_pycolmap
+from surfkit.io.datasets.capture import RawImage, load_pycolmap
 
 
 def shot(model, *params):
-    return Shot(
+    return RawImage(
         "a", np.eye(4), load_pycolmap().Camera(model=model, width=100, height=80, params=list(params)), Path("a")
     )
 

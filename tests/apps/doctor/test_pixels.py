@@ -82,7 +82,7 @@ def test_masks_with_an_alpha_channel_are_told(farm):
 
 
 def test_photographs_that_are_too_large_are_told_before_training(farm, monkeypatch):
-    monkeypatch.setattr(large, "ORDINARY", 1000)
+    monkeypatch.setattr(large, "MAX_UNCHECKED_PIXELS", 1000)
     monkeypatch.setattr(large, "free_bytes", lambda: 10_000)
     for quick in (False, True):
         found = diagnosed(farm, quick)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from surfkit.apps.maps.grid import Grid, Window
+from surfkit.apps.maps.grid import MapGrid, Window
 from surfkit.apps.maps.zbuffer import ZBuffer
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 
 UTM = (451_234.0, 5_873_211.0)
 
@@ -18,7 +18,7 @@ def surface_of(vertices, faces, colors=None):
     rows["x"], rows["y"], rows["z"] = np.asarray(vertices, float).T
     if colors is not None:
         rows["red"], rows["green"], rows["blue"] = np.asarray(colors).T
-    return Surface("mesh.ply", rows, np.asarray(faces, np.int32).reshape(-1, 3))
+    return SurfaceFile("mesh.ply", rows, np.asarray(faces, np.int32).reshape(-1, 3))
 
 
 def heightfield(height, low, high, count=40, color=None):
@@ -60,4 +60,4 @@ def centres(grid):
 
 
 def grid_of(gsd, west, south, east, north):
-    return Grid.around(np.eye(3), gsd, (west, south, east, north))
+    return MapGrid.around(np.eye(3), gsd, (west, south, east, north))

@@ -10,7 +10,7 @@ from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
 from surfkit.apps.maps.make import MapSettings, make_maps
 from surfkit.apps.maps.photographs import between
-from surfkit.apps.texture.make import Subject
+from surfkit.apps.texture.make import MeshWithPhotos
 
 rasterio = needs("rasterio")
 needs("fast_simplification")
@@ -19,7 +19,7 @@ SETTINGS = MapSettings(products=("orthophoto",), colors="photographs", gsd=0.1, 
 
 def orthophoto(scene, out, settings=SETTINGS):
     """What maps.json says; (H, W, 3) colours, (H, W) alpha, and (H, W, 3) places of the centres."""
-    record = make_maps(Subject(scene.surface, scene.frame, scene.views), settings, out)
+    record = make_maps(MeshWithPhotos(scene.surface, scene.frame, scene.views), settings, out)
     with rasterio.open(out / "orthophoto.tif") as file:
         *colors, alpha = file.read()
     west, _, _, north = record["bounds"]

@@ -12,14 +12,14 @@ from PIL import Image
 from surfkit.apps.maps.cloud import sample_evenly, write_cloud
 from surfkit.apps.maps.contours import contour_lines, even_interval
 from surfkit.apps.maps.difference import write_difference
-from surfkit.apps.maps.geotiff import Sheet, workshop
+from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.grid import Window, map_crs, same_crs
 from surfkit.apps.maps.hillshade import hillshade
 from surfkit.apps.maps.make import MapSettings, make_maps
-from surfkit.apps.texture.make import Subject
+from surfkit.apps.texture.make import MeshWithPhotos
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
@@ -97,8 +97,8 @@ def test_points_are_spread_evenly_whatever_the_batches(monkeypatch):
     assert np.abs(points[:, 2] - 0.5 * points[:, 0]).max() < 1e-12
     counts = np.histogram2d(points[:, 0], points[:, 1], 8, ((0, 8), (0, 8)))[0]
     assert np.abs(counts - 5000 / 64).max() < 25
-    monkeypatch.setattr("surfkit.apps.maps.cloud.FACES", 77)
-    monkeypatch.setattr("surfkit.apps.maps.cloud.AT_ONCE", 5)
+    monkeypatch.setattr("surfkit.apps.maps.cloud.BATCH_TRIANGLES", 77)
+    monkeypatch.setattr("surfkit.apps.maps.cloud.BATCH_POINTS", 5)
     again = np.concatenate([each for each, _ in sample_evenly(surface, area / 5000)])
     assert np.allclose(points, again, atol=1e-9)
 
@@ -110,7 +110,7 @@ def test_a_laz_file_is_read_back(tmp_path):
     grid = grid_of(0.25, *UTM, UTM[0] + 20, UTM[1] + 10)
     crs, _ = map_crs(FRAME)
     with workshop(tmp_path, ()) as folder:
-        count = write_cloud(surface, Sheet(grid, crs, folder, tmp_path), "points.laz", 0.2)
+        count = write_cloud(surface, GeoTiffSettings(grid, crs, folder, tmp_path), "points.laz", 0.2)
     with laspy.open(tmp_path / "points.laz") as file:
         header, points = file.header, file.read()
     assert (str(header.version), header.point_format.id, header.are_points_compressed) == ("1.4", 7, True)
@@ -134,7 +134,7 @@ def test_volumes_of_cut_and_fill(tmp_path):
     here = heightfield(rising(0.3), UTM, (UTM[0] + side, UTM[1] + side))
     there = heightfield(rising(0.1), UTM, (UTM[0] + side, UTM[1] + side))
     settings = MapSettings((), gsd, tile=64)
-    found = make_maps(Subject(here, FRAME), settings, tmp_path, there)["difference"]
+    found = make_maps(MeshWithPhotos(here, FRAME), settings, tmp_path, there)["difference"]
     wedge = side * 0.2 * (side / 2) ** 2 / 2
     assert found["area"] == pytest.approx(side**2) and found["only_here"] == found["only_other"] == 0
     assert found["fill"] == pytest.approx(wedge, abs=side**2 * 0.2 * gsd / 8) and found["cut"] == pytest.approx(
@@ -153,7 +153,7 @@ def test_volumes_of_cut_and_fill(tmp_path):
 
 def test_a_surface_does_not_differ_from_itself(tmp_path):
     here = heightfield(rising(0.3), UTM, (UTM[0] + 5, UTM[1] + 5))
-    found = make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path, here)["difference"]
+    found = make_maps(MeshWithPhotos(here, FRAME), MapSettings((), 0.5), tmp_path, here)["difference"]
     assert [found[name] for name in ("fill", "cut", "median", "median_absolute", "percentile_90")] == [0] * 5
 
 
@@ -162,7 +162,7 @@ def test_the_median_of_an_even_number_of_differences_is_a_mean(tmp_path, heights
     grid = grid_of(1.0, *UTM, UTM[0] + len(heights), UTM[1] + 1)
     crs, _ = map_crs(FRAME)
     with workshop(tmp_path, ()) as folder:
-        sheet = Sheet(grid, crs, folder, tmp_path)
+        sheet = GeoTiffSettings(grid, crs, folder, tmp_path)
         for name, row in (("here.tif", heights), ("there.tif", np.zeros(len(heights)))):
             with sheet.raster(name, "heights") as file:
                 file.write(np.array([row]), Window(0, 0, len(heights), 1), {})
@@ -176,7 +176,7 @@ def test_surfaces_apart_cannot_be_subtracted(tmp_path):
     west, east = UTM, (UTM[0] + 30, UTM[1])
     here, there = (heightfield(rising(0), at, (at[0] + 20, at[1] + 20)) for at in (west, east))
     with pytest.raises(BadInput, match="not in the same place"):
-        make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path / "new", there)
+        make_maps(MeshWithPhotos(here, FRAME), MapSettings((), 0.5), tmp_path / "new", there)
     assert not (tmp_path / "new").exists()
 
 
@@ -191,13 +191,13 @@ def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said)
     """Degrees where metres belong, a hole of the mesh: what an earlier call drew, of more products, is still there."""
     parts = [heightfield(rising(0), (UTM[0] + x, UTM[1]), (UTM[0] + x + 20, UTM[1] + 20)) for x in (0, 50)]
     here = merged(*parts)
-    make_maps(Subject(here, FRAME), MapSettings(("hillshade", "contours"), 0.5), tmp_path)
+    make_maps(MeshWithPhotos(here, FRAME), MapSettings(("hillshade", "contours"), 0.5), tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(BadInput, match=said):
-        make_maps(Subject(here, FRAME), MapSettings((), 0.5, bounds=bounds), tmp_path)
+        make_maps(MeshWithPhotos(here, FRAME), MapSettings((), 0.5, bounds=bounds), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert {"dsm.tif", "hillshade.tif", "contours.gpkg", "maps.json"} <= before.keys()
-    make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path)
+    make_maps(MeshWithPhotos(here, FRAME), MapSettings((), 0.5), tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "maps.json"}, "none of other maps stays"
 
 
@@ -214,7 +214,7 @@ def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said)
 def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
     here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
     frame = Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)
-    assert make_maps(Subject(here, frame), MapSettings((), 0.5), tmp_path)["unit"] == unit
+    assert make_maps(MeshWithPhotos(here, frame), MapSettings((), 0.5), tmp_path)["unit"] == unit
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,9 @@ def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
 def test_a_system_that_would_make_volumes_wrong_is_refused(tmp_path, crs, metres, said):
     here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
     with pytest.raises(BadInput, match=said):
-        make_maps(Subject(here, Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)), MapSettings((), 0.5), tmp_path / "m")
+        make_maps(
+            MeshWithPhotos(here, Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)), MapSettings((), 0.5), tmp_path / "m"
+        )
     assert not (tmp_path / "m").exists()
 
 
@@ -264,7 +266,7 @@ def test_all_products_of_a_hill(tmp_path):
         return np.tile([[90, 80, 70]], (len(x), 1))
 
     surface = heightfield(cone, (UTM[0] - 15, UTM[1] - 15), (UTM[0] + 15, UTM[1] + 15), 40, color)
-    record = make_maps(Subject(surface, FRAME), MapSettings(gsd=0.25, interval=5.0, tile=50), tmp_path)
+    record = make_maps(MeshWithPhotos(surface, FRAME), MapSettings(gsd=0.25, interval=5.0, tile=50), tmp_path)
     assert json.loads((tmp_path / "maps.json").read_text()) == record
     assert record["files"] == ["dsm.tif", "orthophoto.tif", "hillshade.tif", "contours.gpkg", "points.laz"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*record["files"], "maps.json"])
@@ -291,7 +293,7 @@ def test_level_ground_and_heights_in_millions(tmp_path):
     read = needs("pyogrio.raw").read
     laspy = needs("laspy")
     flat = heightfield(lambda x, y: 0 * x + 6_371_000.125, UTM, (UTM[0] + 5, UTM[1] + 5))
-    record = make_maps(Subject(flat, FRAME), MapSettings(("contours", "points"), 0.1), tmp_path)
+    record = make_maps(MeshWithPhotos(flat, FRAME), MapSettings(("contours", "points"), 0.1), tmp_path)
     assert record["contours"]["lines"] == 0 and len(read(tmp_path / "contours.gpkg")[2]) == 0
     assert np.abs(laspy.read(tmp_path / "points.laz").z - 6_371_000.125).max() < 1e-3
     with rasterio.open(tmp_path / "dsm.tif") as file:
@@ -317,7 +319,9 @@ def test_the_ground_sampling_distance_is_that_of_a_pixel():
 def test_colours_that_are_not_there_are_said(tmp_path, capsys):
     surface = heightfield(cone, UTM, (UTM[0] + 5, UTM[1] + 5))
     record = make_maps(
-        Subject(Surface("a.ply", surface.rows, surface.faces), FRAME), MapSettings(("orthophoto",), 1.0), tmp_path
+        MeshWithPhotos(SurfaceFile("a.ply", surface.rows, surface.faces), FRAME),
+        MapSettings(("orthophoto",), 1.0),
+        tmp_path,
     )
     assert record["files"] == ["dsm.tif"]
 

@@ -11,8 +11,8 @@ from town import town
 
 from surfkit.apps.maps import contours, surface_model
 from surfkit.apps.maps import make as making
-from surfkit.apps.maps.make import MapSettings, Subject, make_maps
-from surfkit.apps.maps.ours import NAMES, WORK
+from surfkit.apps.maps.make import MapSettings, MeshWithPhotos, make_maps
+from surfkit.apps.maps.ours import NAMES_FILE, UNFINISHED_FOLDER
 from surfkit.apps.texture import make as texturing
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
@@ -54,10 +54,10 @@ def counted(monkeypatch, module, name):
 def test_the_same_bytes_after_an_interruption_anywhere(tmp_path, monkeypatch, same_date):
     needs("laspy"), needs("lazrs")
     here, there = hill(4.0), hill(5.0, color=False)
-    make_maps(Subject(here, FRAME), SETTINGS, tmp_path / "whole", there)
+    make_maps(MeshWithPhotos(here, FRAME), SETTINGS, tmp_path / "whole", there)
     tiles = counted(monkeypatch, surface_model, "drawn_tile")
     lines = counted(monkeypatch, contours, "contour_lines")
-    calls = interrupted_often(lambda: make_maps(Subject(here, FRAME), SETTINGS, tmp_path / "parts", there))
+    calls = interrupted_often(lambda: make_maps(MeshWithPhotos(here, FRAME), SETTINGS, tmp_path / "parts", there))
     assert calls > 20
     assert digests(tmp_path / "parts") == digests(tmp_path / "whole")
     assert len(tiles) == 2 * 4 and len(lines) == 4, "what is finished is not done again"
@@ -66,10 +66,10 @@ def test_the_same_bytes_after_an_interruption_anywhere(tmp_path, monkeypatch, sa
 def test_colors_of_photographs_too(tmp_path, monkeypatch):
     needs("fast_simplification")
     monkeypatch.setattr(texturing, "PAUSE_S", 0.0)
-    monkeypatch.setattr(texturing, "SHARE", 0.0)
+    monkeypatch.setattr(texturing, "SAVE_PAUSE_FACTOR", 0.0)
     (tmp_path / "town").mkdir()
     scene = town(tmp_path / "town")
-    subject = Subject(scene.surface, scene.frame, scene.views)
+    subject = MeshWithPhotos(scene.surface, scene.frame, scene.views)
     settings = MapSettings(("orthophoto",), colors="photographs", gsd=0.3, up="z", memory="100MB", tile=48)
     make_maps(subject, settings, tmp_path / "whole")
     looks = counted(monkeypatch, texturing, "sight")
@@ -89,8 +89,12 @@ def stopped(monkeypatch, subject, settings, out):
 def test_only_what_is_the_same_goes_on(tmp_path, monkeypatch, what):
     settings = replace(SETTINGS, products=("contours",))
     surface = hill(4.0)
-    stopped(monkeypatch, Subject(surface, FRAME), settings, tmp_path)
-    assert (tmp_path / "dsm.tif").exists() and (tmp_path / WORK).is_dir() and not (tmp_path / "maps.json").exists()
+    stopped(monkeypatch, MeshWithPhotos(surface, FRAME), settings, tmp_path)
+    assert (
+        (tmp_path / "dsm.tif").exists()
+        and (tmp_path / UNFINISHED_FOLDER).is_dir()
+        and not (tmp_path / "maps.json").exists()
+    )
     if what == "setting":
         settings = replace(settings, gsd=0.25)
     elif what == "mesh":
@@ -101,21 +105,21 @@ def test_only_what_is_the_same_goes_on(tmp_path, monkeypatch, what):
         (tmp_path / "dsm.tif").write_bytes((tmp_path / "dsm.tif").read_bytes()[:-1])
     tiles, said = counted(monkeypatch, surface_model, "drawn_tile"), []
     monkeypatch.setattr("surfkit.core.stages.emit", said.append)
-    record = make_maps(Subject(surface, FRAME), settings, tmp_path)
+    record = make_maps(MeshWithPhotos(surface, FRAME), settings, tmp_path)
     assert bool(tiles) == (what != "nothing")
     anew = [event.text for event in said if isinstance(event, Warned)]
     assert len(anew) == (what in ("setting", "mesh")) and all("other inputs or settings" in text for text in anew)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*record["files"], "maps.json"])
-    make_maps(Subject(surface, FRAME), settings, tmp_path / "whole")
+    make_maps(MeshWithPhotos(surface, FRAME), settings, tmp_path / "whole")
     assert digests(tmp_path)["dsm.tif"] == digests(tmp_path / "whole")["dsm.tif"]
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
-    (tmp_path / WORK).mkdir()
-    (tmp_path / WORK / "novel.txt").write_text("chapter 1")
+    (tmp_path / UNFINISHED_FOLDER).mkdir()
+    (tmp_path / UNFINISHED_FOLDER / "novel.txt").write_text("chapter 1")
     with pytest.raises(BadInput, match="not surfkit's"):
-        make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
-    assert (tmp_path / WORK / "novel.txt").read_text() == "chapter 1"
+        make_maps(MeshWithPhotos(hill(4.0), FRAME), SETTINGS, tmp_path)
+    assert (tmp_path / UNFINISHED_FOLDER / "novel.txt").read_text() == "chapter 1"
 
 
 def files_of(folder):
@@ -126,33 +130,33 @@ def files_of(folder):
 def test_files_of_another_program_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("of another program")
     with pytest.raises(OSError, match=f"surfkit did not write, .*: '{name}'; name another folder"):
-        make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
+        make_maps(MeshWithPhotos(hill(4.0), FRAME), SETTINGS, tmp_path)
     assert files_of(tmp_path) == {name: b"of another program"}
 
 
 def test_beside_our_maps_too(tmp_path, monkeypatch):
     """Maps that are made again, also smaller ones, or after an interruption, replace and delete ours alone."""
     few, less = replace(SETTINGS, products=("contours",)), replace(SETTINGS, products=())
-    make_maps(Subject(hill(4.0), FRAME), few, tmp_path)
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), few, tmp_path)
     (tmp_path / "hillshade.tif").write_text("of another program")
     (tmp_path / "difference.png").symlink_to("nowhere")
-    make_maps(Subject(hill(4.0), FRAME), few, tmp_path)
-    stopped(monkeypatch, Subject(hill(4.0), FRAME), few, tmp_path)
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), few, tmp_path)
+    stopped(monkeypatch, MeshWithPhotos(hill(4.0), FRAME), few, tmp_path)
     before = files_of(tmp_path)
     for settings, other in ((replace(SETTINGS, products=("hillshade",)), None), (few, hill(3.0))):
         with pytest.raises(OSError, match="surfkit did not write, .*: '(hillshade.tif|difference.png)';"):
-            make_maps(Subject(hill(4.0), FRAME), settings, tmp_path, other)
+            make_maps(MeshWithPhotos(hill(4.0), FRAME), settings, tmp_path, other)
     assert files_of(tmp_path) == before
-    make_maps(Subject(hill(4.0), FRAME), less, tmp_path)
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), less, tmp_path)
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"dsm.tif", "maps.json", "hillshade.tif", "difference.png"}
     assert (tmp_path / "hillshade.tif").read_text() == "of another program"
 
 
 def test_what_a_version_before_left_of_an_interruption_is_ours(tmp_path, monkeypatch):
-    stopped(monkeypatch, Subject(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
-    (tmp_path / WORK / NAMES).unlink()
-    make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
+    stopped(monkeypatch, MeshWithPhotos(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
+    (tmp_path / UNFINISHED_FOLDER / NAMES_FILE).unlink()
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), SETTINGS, tmp_path)
     assert (tmp_path / "maps.json").exists()
 
 
@@ -160,7 +164,7 @@ def test_maps_that_end_half_way_leave_nothing_that_is_in_the_way(tmp_path, monke
     with monkeypatch.context() as change:
         change.setattr(making, "trace", lambda *_: (_ for _ in ()).throw(BadInput("too many levels")))
         with pytest.raises(BadInput, match="too many levels"):
-            make_maps(Subject(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
+            make_maps(MeshWithPhotos(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -168,8 +172,8 @@ def test_a_record_names_no_file_outside(tmp_path):
     """maps.json lies in a folder that others may write to: what it names is deleted only if it is a map's name."""
     (tmp_path / "maps").mkdir()
     (tmp_path / "kept.txt").write_text("chapter 1")
-    make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path / "maps")
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), SETTINGS, tmp_path / "maps")
     record = json.loads((tmp_path / "maps/maps.json").read_text())
     (tmp_path / "maps/maps.json").write_text(json.dumps(record | {"files": ["../kept.txt", *record["files"]]}))
-    make_maps(Subject(hill(4.0), FRAME), replace(SETTINGS, products=()), tmp_path / "maps")
+    make_maps(MeshWithPhotos(hill(4.0), FRAME), replace(SETTINGS, products=()), tmp_path / "maps")
     assert (tmp_path / "kept.txt").read_text() == "chapter 1"

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from needs import needs
 
-from surfkit.apps.maps.geotiff import Sheet, workshop
-from surfkit.apps.maps.grid import Grid, map_crs
+from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
+from surfkit.apps.maps.grid import MapGrid, map_crs
 from surfkit.apps.maps.rasters import NODATA
 from surfkit.apps.maps.surface_model import draw_surface, needs_double
-from surfkit.apps.maps.zbuffer import NONE
+from surfkit.apps.maps.zbuffer import NO_TRIANGLE
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.scene.earth import geocentric, to_ecef
@@ -26,7 +26,7 @@ def test_a_plane_far_from_the_origin_is_exact_and_has_no_crack():
 
     surface = heightfield(height, UTM, (UTM[0] + 20, UTM[1] + 20))
     found, face, x, y = drawn(surface, grid_of(0.1, *UTM, UTM[0] + 20, UTM[1] + 20))
-    assert (face != NONE).all() and found.shape == (200, 200)
+    assert (face != NO_TRIANGLE).all() and found.shape == (200, 200)
     assert np.abs(found - height(x, y)).max() < 1e-8
 
 
@@ -54,7 +54,7 @@ def test_a_pyramid_and_a_sphere():
     found, face, x, y = drawn(surface_of(ball.reshape(-1, 3), faces), grid_of(0.05, -1, -1, 1, 1))
     inside = np.hypot(x, y) < 0.9
     assert np.abs(found - np.sqrt(np.maximum(0, 1 - x**2 - y**2)))[inside].max() < 5e-4, "the upper side"
-    assert (face[np.hypot(x, y) > 1] == NONE).all()
+    assert (face[np.hypot(x, y) > 1] == NO_TRIANGLE).all()
 
 
 def test_what_hangs_over_counts():
@@ -82,7 +82,7 @@ def written(surface, out, side, gsd=0.25, frame=None):
     grid = grid_of(gsd, UTM[0] - 3, UTM[1] - 3, UTM[0] + 63, UTM[1] + 63)
     crs, _ = map_crs(frame or Frame(np.zeros(3), 1.0, 1.0, "EPSG:32633"))
     with workshop(out, ("dsm.tif",)) as folder:
-        facts = draw_surface(surface, Sheet(grid, crs, folder, out), side, "dsm.tif", "orthophoto.tif")
+        facts = draw_surface(surface, GeoTiffSettings(grid, crs, folder, out), side, "dsm.tif", "orthophoto.tif")
     return grid, facts
 
 
@@ -113,9 +113,9 @@ def test_geotiffs_are_read_back(surface, tmp_path):
 
 def test_tiles_change_no_bit(surface, tmp_path, monkeypatch):
     written(surface, tmp_path / "whole", 2048)
-    monkeypatch.setattr("surfkit.apps.maps.bins.FACES", 1000)
-    monkeypatch.setattr("surfkit.apps.maps.zbuffer.AT_ONCE", 500)
-    monkeypatch.setattr("surfkit.apps.maps.surface_model.CELLS", 300)
+    monkeypatch.setattr("surfkit.apps.maps.bins.BATCH_TRIANGLES", 1000)
+    monkeypatch.setattr("surfkit.apps.maps.zbuffer.BATCH_TRIANGLE_CELLS", 500)
+    monkeypatch.setattr("surfkit.apps.maps.surface_model.BATCH_CELLS", 300)
     written(surface, tmp_path / "tiled", 37)
     for name in ("dsm.tif", "orthophoto.tif"):
         with rasterio.open(tmp_path / "whole" / name) as whole, rasterio.open(tmp_path / "tiled" / name) as tiled:
@@ -125,7 +125,7 @@ def test_tiles_change_no_bit(surface, tmp_path, monkeypatch):
 def test_a_triangle_larger_than_memory_for_it(monkeypatch):
     surface = surface_of([[-500, -500, 1], [700, -500, 1], [-500, 700, 7]], [[0, 1, 2]])
     whole, *_ = drawn(surface, grid_of(1.0, 0, 0, 90, 90))
-    monkeypatch.setattr("surfkit.apps.maps.zbuffer.AT_ONCE", 1000)
+    monkeypatch.setattr("surfkit.apps.maps.zbuffer.BATCH_TRIANGLE_CELLS", 1000)
     pieces, *_ = drawn(surface, grid_of(1.0, 0, 0, 90, 90))
     assert (whole == pieces).all() and np.isfinite(whole).all()
 
@@ -136,7 +136,7 @@ def test_axes_for_another_direction_that_is_up(up):
     assert np.allclose(turn @ turn.T, np.eye(3)) and np.isclose(np.linalg.det(turn), 1)
     assert np.allclose(turn @ up, [0, 0, 1])
     flat = surface_of(np.array([[0, 0, 5], [8, 0, 5], [0, 8, 5]]) @ turn, [[0, 1, 2]])
-    found, face, *_ = drawn(flat, Grid.around(turn, 1.0, (0, 0, 4, 4)))
+    found, face, *_ = drawn(flat, MapGrid.around(turn, 1.0, (0, 0, 4, 4)))
     assert np.allclose(found, 5)
     assert (map_axes(np.array([0.0, 0.0, 1.0])) == np.eye(3)).all()
 

@@ -13,7 +13,7 @@ import torch
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.render.frames import RECORD, draw_frames, identity, shown
+from surfkit.apps.render.frames import FRAMES_RECORD, draw_frames, identity, shown
 from surfkit.apps.render.path import flyover, from_file, lens_of, middle_of, orbit, posed, through
 from surfkit.apps.render.video import write_video
 from surfkit.cli import main
@@ -24,7 +24,7 @@ from surfkit.core.registry import plugins
 from surfkit.io.splats.cameras import write_cameras
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.scene import Frame, Scene, SparsePoints, View
 
 UP = np.array([0.0, 0.0, 1.0])
 LENS = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 32.0, 24.0, 64, 48)
@@ -47,7 +47,7 @@ def survey(height=3.0, points=True, frame=None):
         torch.tensor([[0.2, 0.1, 0.0]]).repeat(9 if points else 0, 1)
         + torch.linspace(-1, 1, 9 if points else 0)[:, None]
     )
-    return Scene("survey", tuple(views), (), Cloud(xyz, xyz.to(torch.uint8)), frame or Frame(np.zeros(3), 1.0))
+    return Scene("survey", tuple(views), (), SparsePoints(xyz, xyz.to(torch.uint8)), frame or Frame(np.zeros(3), 1.0))
 
 
 def axis(camera):
@@ -233,7 +233,7 @@ def test_frames_go_on_where_they_stopped(tmp_path, warned):
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
     (tmp_path / "000000.png").write_bytes(b"mine")
     for replace_frames in (False, True):
-        with pytest.raises(BadInput, match=f"it has files but no {RECORD}"):
+        with pytest.raises(BadInput, match=f"it has files but no {FRAMES_RECORD}"):
             draw_frames(tmp_path, [LENS], Drawing(), "color", "model", replace_frames)
     assert (tmp_path / "000000.png").read_bytes() == b"mine"
 
@@ -283,7 +283,7 @@ def test_the_command(trained, tmp_path, capsys):
     words = ["render", str(run), "--seconds", "0.2", "--fps", "10", "--size", "40x30", "--out", str(out)]
     assert main([*words, "--path", "flyover"]) == 0
     assert "2, 0.2 s at 10 per second" in capsys.readouterr().out
-    assert sorted(path.name for path in out.iterdir()) == ["000000.png", "000001.png", RECORD]
+    assert sorted(path.name for path in out.iterdir()) == ["000000.png", "000001.png", FRAMES_RECORD]
     assert Image.open(out / "000001.png").size == (40, 30) and np.asarray(Image.open(out / "000000.png")).std() > 5
     before = (out / "000000.png").stat().st_mtime_ns
     assert main([*words, "--path", "flyover"]) == 0 and (out / "000000.png").stat().st_mtime_ns == before

@@ -12,8 +12,8 @@ from html_pages import COLORS, HEIGHT, WIDTH, Reader, full_run, journal, plain_r
 from PIL import Image
 
 from surfkit.apps.report import gallery
-from surfkit.apps.report.elements import Picture
-from surfkit.apps.report.page import Options, html, page_of
+from surfkit.apps.report.elements import EmbeddedPicture
+from surfkit.apps.report.page import ReportOptions, html, page_of
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 
@@ -26,7 +26,7 @@ HOSTILE = (
 
 def page(*folders, **options):
     """The text of a report, and what a parser finds in it."""
-    text = html(page_of(folders, Options(**options)))
+    text = html(page_of(folders, ReportOptions(**options)))
     return text, Reader(text)
 
 
@@ -202,8 +202,8 @@ def test_without_pictures(run):
 def test_pictures_keep_to_the_budget(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (100, 1000, 3), np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.png")
-    picture = Picture(tmp_path / "noise.png", "noise")
-    sizes = [(one := gallery.encode(picture, side)).width for side in gallery.SIDES]
+    picture = EmbeddedPicture(tmp_path / "noise.png", "noise")
+    sizes = [(one := gallery.encode(picture, side)).width for side in gallery.LONGEST_SIDES_PX]
     assert sizes == [1000, 960, 720, 540, 400]
     budget = len(gallery.encode(picture, 720).uri)
     assert gallery.encode_all([picture], budget)[picture].width == 720
@@ -248,7 +248,7 @@ def test_values_of_a_wrong_kind_are_left_out(run, monkeypatch):
         for odd in (None, "x", [1, [2]], {"a": {"b": []}}, -1e308):
             for wrong in replaced(json.loads(whole), odd):
                 (run / name).write_text(json.dumps(wrong))
-                page_of([run], Options(with_pictures=False))
+                page_of([run], ReportOptions(with_pictures=False))
         (run / name).write_text(whole)
 
 

@@ -48,31 +48,38 @@ def test_a_photograph_that_says_nothing(photo):
 def test_where_altitudes_are_0(reference, version, flag, zero):
     """2 and 3 are sea level. 0 and 1 are it up to EXIF 2.32, and the ellipsoid from 3.0 on (CIPA DC-008); drones with
     RTK write heights above the ellipsoid under the older 0."""
-    gps = {exif.ALTITUDE: 120.0} | ({} if reference is None else {exif.ALTITUDE_REF: bytes([reference])})
+    gps = {exif.ALTITUDE_TAG: 120.0} | ({} if reference is None else {exif.ALTITUDE_REF_TAG: bytes([reference])})
     xmp = {} if flag is None else {"RtkFlag": float(flag)}
     camera = {} if version is None else {36864: version}
     assert facts({}, camera, gps, xmp, (40, 30)).zero == zero
-    assert facts({}, {}, {exif.ALTITUDE_REF: b"\0"}, xmp, (40, 30)).zero is None, "no altitude"
+    assert facts({}, {}, {exif.ALTITUDE_REF_TAG: b"\0"}, xmp, (40, 30)).zero is None, "no altitude"
 
 
 def test_camera_time_and_orientation(photo):
-    basic = {exif.MAKE: "DJI\0", exif.MODEL: "FC6310", exif.ORIENTATION: 6}
-    write_exif(photo, basic=basic, camera={exif.TAKEN: "2024:05:01 12:00:00", exif.SUBSECOND: "25"})
+    basic = {exif.MAKE_TAG: "DJI\0", exif.MODEL_TAG: "FC6310", exif.ORIENTATION_TAG: 6}
+    write_exif(photo, basic=basic, camera={exif.TAKEN_TAG: "2024:05:01 12:00:00", exif.SUBSECOND_TAG: "25"})
     found = read(photo)
     assert (found.camera, found.taken, found.orientation) == ("DJI FC6310", "2024:05:01 12:00:00.25", 6)
 
 
 def test_focal_lengths():
     size = (5472, 3648)
-    diagonal = facts({}, {exif.FOCAL35_MM: 24}, {}, {}, size).focal_px
+    diagonal = facts({}, {exif.FOCAL35_MM_TAG: 24}, {}, {}, size).focal_px
     assert diagonal == pytest.approx(24 / 36 * 5472, rel=1e-3)  # 3:2 as film is, so width and diagonal agree
-    plane = {exif.FOCAL_MM: IFDRational(88, 10), exif.PIXELS_X: 5472, exif.PER_UNIT_X: 5472 / 13.2, exif.UNIT: 3}
-    assert facts({}, plane | {exif.PER_UNIT_X: 5472 / 1.32}, {}, {}, size).focal_px == pytest.approx(8.8 / 13.2 * 5472)
-    half = facts({}, plane | {exif.PER_UNIT_X: 5472 / 1.32}, {}, {}, (2736, 1824)).focal_px
+    plane = {
+        exif.FOCAL_MM_TAG: IFDRational(88, 10),
+        exif.PIXELS_X_TAG: 5472,
+        exif.PER_UNIT_X_TAG: 5472 / 13.2,
+        exif.UNIT_TAG: 3,
+    }
+    assert facts({}, plane | {exif.PER_UNIT_X_TAG: 5472 / 1.32}, {}, {}, size).focal_px == pytest.approx(
+        8.8 / 13.2 * 5472
+    )
+    half = facts({}, plane | {exif.PER_UNIT_X_TAG: 5472 / 1.32}, {}, {}, (2736, 1824)).focal_px
     assert half == pytest.approx(8.8 / 13.2 * 2736)  # reduced by a program that kept EXIF
-    assert facts({}, {exif.FOCAL_MM: 8.8}, {}, {}, size).focal_px is None
-    dpi = {exif.FOCAL_MM: 8.8, exif.PIXELS_X: 5472, exif.PER_UNIT_X: 72, exif.UNIT: 2}
-    for wrong in ({exif.FOCAL35_MM: 65535}, {exif.FOCAL35_MM: 1}, dpi):
+    assert facts({}, {exif.FOCAL_MM_TAG: 8.8}, {}, {}, size).focal_px is None
+    dpi = {exif.FOCAL_MM_TAG: 8.8, exif.PIXELS_X_TAG: 5472, exif.PER_UNIT_X_TAG: 72, exif.UNIT_TAG: 2}
+    for wrong in ({exif.FOCAL35_MM_TAG: 65535}, {exif.FOCAL35_MM_TAG: 1}, dpi):
         assert facts({}, wrong, {}, {}, size).focal_px is None, "a wrong one would be held to"
 
 
@@ -89,20 +96,25 @@ def test_focal_lengths():
 )
 def test_accuracies(xmp, found):
     assert facts({}, {}, {}, read_xmp(xmp and xmp.encode()), (40, 30)).accuracy_m == found
-    assert facts({}, {}, {exif.ERROR_M: 4.0}, {}, (40, 30)).accuracy_m == (4, 4, 8)
+    assert facts({}, {}, {exif.ERROR_M_TAG: 4.0}, {}, (40, 30)).accuracy_m == (4, 4, 8)
 
 
 @pytest.mark.parametrize("south, below, height", [("S", b"\x03", -12.5), ("South", b"\x02", 12.5), ("s", 1, -12.5)])
 def test_halves_of_the_earth_and_heights_below_either_zero(south, below, height):
-    gps = {exif.LATITUDE_REF: south, exif.LATITUDE: (33, 30, 0), exif.LONGITUDE_REF: "W", exif.LONGITUDE: (70, 0, 0)}
-    found = facts({}, {}, gps | {exif.ALTITUDE_REF: below, exif.ALTITUDE: 12.5}, {}, (40, 30)).position
+    gps = {
+        exif.LATITUDE_REF_TAG: south,
+        exif.LATITUDE_TAG: (33, 30, 0),
+        exif.LONGITUDE_REF_TAG: "W",
+        exif.LONGITUDE_TAG: (70, 0, 0),
+    }
+    found = facts({}, {}, gps | {exif.ALTITUDE_REF_TAG: below, exif.ALTITUDE_TAG: 12.5}, {}, (40, 30)).position
     assert found == (-33.5, -70, height)
 
 
 def test_which_of_several_equal_cameras_it_is():
-    basic = {exif.MAKE: "MicaSense", exif.MODEL: "RedEdge", exif.ORIENTATION: IFDRational(6)}
+    basic = {exif.MAKE_TAG: "MicaSense", exif.MODEL_TAG: "RedEdge", exif.ORIENTATION_TAG: IFDRational(6)}
     rig = read_xmp("<Camera:RigCameraIndex>2</Camera:RigCameraIndex>")
-    found = facts(basic, {exif.BODY: "RX01-17"}, {}, rig, (40, 30))
+    found = facts(basic, {exif.BODY_SERIAL_TAG: "RX01-17"}, {}, rig, (40, 30))
     assert found.which == "MicaSense RedEdge RX01-17 2.0" and found.camera == "MicaSense RedEdge"
     assert facts(basic, {}, {}, {}, (40, 30)).which == "MicaSense RedEdge"
     assert type(found.orientation) is int and found.orientation == 6, "it is kept as a whole number"
@@ -128,7 +140,12 @@ def test_which_of_several_equal_cameras_it_is():
     ],
 )
 def test_degrees_and_their_sign(value, letter, wanted, signed):
-    gps = {exif.LATITUDE: value, exif.LATITUDE_REF: letter, exif.LONGITUDE: (70, 0, 0), exif.LONGITUDE_REF: "E"}
+    gps = {
+        exif.LATITUDE_TAG: value,
+        exif.LATITUDE_REF_TAG: letter,
+        exif.LONGITUDE_TAG: (70, 0, 0),
+        exif.LONGITUDE_REF_TAG: "E",
+    }
     found = facts({}, {}, gps, {}, (40, 30))
     assert found.position == (pytest.approx(wanted), 70, None)
     assert found.unsigned == (() if signed else ("latitude",)), "without a sign it is not north by default"
@@ -139,12 +156,12 @@ def test_degrees_and_their_sign(value, letter, wanted, signed):
     [(None, 12.5, True), (b"", 12.5, True), (b"\0", 12.5, False), (b"\1", -12.5, False), ("1", -12.5, False)],
 )
 def test_what_altitudes_are_counted_from(reference, height, unsure):
-    gps = {1: "N", 2: (1, 0, 0), 3: "E", 4: (1, 0, 0), exif.ALTITUDE: 12.5, exif.ALTITUDE_REF: reference}
+    gps = {1: "N", 2: (1, 0, 0), 3: "E", 4: (1, 0, 0), exif.ALTITUDE_TAG: 12.5, exif.ALTITUDE_REF_TAG: reference}
     found = facts({}, {}, gps, {}, (40, 30))
     assert (found.position[2], found.no_reference) == (height, unsure)
-    found = facts({}, {}, gps | {exif.ALTITUDE: -12.5, exif.ALTITUDE_REF: b"\1"}, {}, (40, 30))
+    found = facts({}, {}, gps | {exif.ALTITUDE_TAG: -12.5, exif.ALTITUDE_REF_TAG: b"\1"}, {}, (40, 30))
     assert found.position[2] == -12.5, "below, said twice"
-    found = facts({}, {}, gps | {exif.ALTITUDE: IFDRational(0, 0)}, {}, (40, 30))
+    found = facts({}, {}, gps | {exif.ALTITUDE_TAG: IFDRational(0, 0)}, {}, (40, 30))
     assert found.position[2] is None and not found.no_reference
 
 
@@ -189,12 +206,12 @@ def test_positions_in_xmp(xmp, position, altitude, above):
 @pytest.mark.parametrize(
     "gps",
     [
-        {exif.LATITUDE: (0, 0, 0), exif.LONGITUDE: (0, 0, 0), exif.ALTITUDE: 0},  # a receiver without a fix
-        {exif.LATITUDE: (91, 0, 0), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
-        {exif.LATITUDE: (52, 0, math.nan), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
-        {exif.LATITUDE: 52, exif.LONGITUDE: "x", exif.ALTITUDE: 1},
-        {exif.LATITUDE: (52, 0, 0, 0), exif.LONGITUDE: (10, 0, 0)},
-        {exif.LATITUDE: (52, 0, IFDRational(1, 0)), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
+        {exif.LATITUDE_TAG: (0, 0, 0), exif.LONGITUDE_TAG: (0, 0, 0), exif.ALTITUDE_TAG: 0},  # a receiver without a fix
+        {exif.LATITUDE_TAG: (91, 0, 0), exif.LONGITUDE_TAG: (10, 0, 0), exif.ALTITUDE_TAG: 1},
+        {exif.LATITUDE_TAG: (52, 0, math.nan), exif.LONGITUDE_TAG: (10, 0, 0), exif.ALTITUDE_TAG: 1},
+        {exif.LATITUDE_TAG: 52, exif.LONGITUDE_TAG: "x", exif.ALTITUDE_TAG: 1},
+        {exif.LATITUDE_TAG: (52, 0, 0, 0), exif.LONGITUDE_TAG: (10, 0, 0)},
+        {exif.LATITUDE_TAG: (52, 0, IFDRational(1, 0)), exif.LONGITUDE_TAG: (10, 0, 0), exif.ALTITUDE_TAG: 1},
     ],
 )
 def test_what_is_no_position(gps):

@@ -9,7 +9,7 @@ from surfkit.apps.sfm.adjust import adjust
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import Focal, height_stretch, weighed
 from surfkit.apps.sfm.positions import Positions
-from surfkit.apps.sfm.prepare import Preparation
+from surfkit.apps.sfm.prepare import SfmPreparation
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.site import readings
 from surfkit.runs.notes import collect_notes
@@ -36,7 +36,7 @@ def placed(flight, focal_px, folder, sigma=(2.0, 2.0, 4.0), stated=None):
         replace(photo, exif=replace(photo.exif, position=tuple(place), accuracy_m=stated))
         for photo, place in zip(flight.photos(focal_px).values(), positions.tolist(), strict=True)
     ]
-    preparation, given = Preparation(folder, folder / "scene", Settings()), Positions(photos)
+    preparation, given = SfmPreparation(folder, folder / "scene", Settings()), Positions(photos)
     with collect_notes():
         [(model, _, found)] = preparation._place([folder / "model"], given, readings(given, "auto"))
     return alone, model, found

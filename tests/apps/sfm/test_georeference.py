@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.georeference import Chart, Placement, Refused, chart_of, place, to_chart
+from surfkit.apps.sfm.georeference import MapProjection, NoSimilarity, Placement, chart_of, place, to_chart
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.core.check import BadInput
 from surfkit.runs.notes import collect_notes
@@ -42,7 +42,7 @@ def placed(onto, **kwargs):
 def test_cameras_come_to_their_positions():
     onto = grid()
     found = placed(onto)
-    assert found.chart == Chart("EPSG:32633", (EAST, NORTH, 0.0)) and found.fit.inside.all()
+    assert found.chart == MapProjection("EPSG:32633", (EAST, NORTH, 0.0)) and found.fit.inside.all()
     shots, _ = survey(onto)
     np.testing.assert_allclose(found.similarity.points(np.stack(list(shots.values()))), onto, atol=1e-3)
     assert found.similarity.scale == pytest.approx(50, rel=1e-6)
@@ -63,7 +63,7 @@ def test_a_photograph_500_m_off_is_named_and_has_no_say():
 
 def test_a_line_determines_no_turn():
     found = placed(np.column_stack([np.linspace(0, 300, 12), np.linspace(0, 100, 12), np.full(12, 60.0)]), noise=0.5)
-    assert isinstance(found, Refused) and "along a line" in found.reason
+    assert isinstance(found, NoSimilarity) and "along a line" in found.reason
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_line_determines_no_turn():
 )
 def test_what_is_refused(onto, noise, said):
     found = placed(onto, noise=noise)
-    assert isinstance(found, Refused) and said in found.reason
+    assert isinstance(found, NoSimilarity) and said in found.reason
 
 
 def test_rtk_positions_are_believed():
@@ -98,8 +98,8 @@ def test_positions_that_state_an_accuracy_among_others_that_state_none():
 def test_a_receiver_that_gave_one_position_only_determines_nothing(count):
     shots, photos = survey(grid(count))
     photos = [Photo(photo.name, (0, 0), exif=photos[0].exif) for photo in photos]
-    found = place(shots, photos, Chart("EPSG:32633", (EAST, NORTH, 0.0)))
-    assert isinstance(found, Refused) and f"{count} of {count} positions are one place" in found.reason
+    found = place(shots, photos, MapProjection("EPSG:32633", (EAST, NORTH, 0.0)))
+    assert isinstance(found, NoSimilarity) and f"{count} of {count} positions are one place" in found.reason
 
 
 @pytest.mark.parametrize("crs", ["auto", "EPSG:2180"])
@@ -168,8 +168,8 @@ def test_systems_that_will_not_do(crs, said):
 def test_a_group_without_positions_is_refused_on_every_map():
     shots, _ = survey(grid(5))
     for crs in ("EPSG:32633", "EPSG:2180"):
-        found = place(shots, [Photo(name, (0, 0)) for name in shots], Chart(crs, (0.0, 0.0, 0.0)))
-        assert isinstance(found, Refused) and "0 of 5 placed photographs have a position" in found.reason
+        found = place(shots, [Photo(name, (0, 0)) for name in shots], MapProjection(crs, (0.0, 0.0, 0.0)))
+        assert isinstance(found, NoSimilarity) and "0 of 5 placed photographs have a position" in found.reason
 
 
 def test_at_the_pole_a_system_must_be_named():

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.georeference import Refused
+from surfkit.apps.sfm.georeference import NoSimilarity
 from surfkit.apps.sfm.ground_control import doubts, place_by_points, read_ground, read_list, triangulate
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.plausible import upside_down
@@ -176,16 +176,16 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
 def test_heights_that_count_down_are_found_out(tmp_path):
     path, mirror = tmp_path / "gcp_list.txt", np.array([1, 1, -1])
     found = place_by_points(model(), read_ground(written(path, places=PLACES * mirror), "auto", SIZES), 0)
-    assert isinstance(found, Refused) and "fit mirrored only, to 0.00 m for" in found.reason
+    assert isinstance(found, NoSimilarity) and "fit mirrored only, to 0.00 m for" in found.reason
     noise = np.random.default_rng(0).normal(0, 0.3, PLACES.shape)
     found = place_by_points(model(), read_ground(written(path, places=PLACES + noise), "auto", SIZES), 0)
-    assert not isinstance(found, Refused)
+    assert not isinstance(found, NoSimilarity)
 
 
 def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):
     places = np.random.default_rng(5).permutation(PLACES)
     found = place_by_points(model(), read_ground(written(tmp_path / "gcp_list.txt", places=places), "auto", SIZES), 0)
-    assert isinstance(found, Refused) and "too large for" in found.reason
+    assert isinstance(found, NoSimilarity) and "too large for" in found.reason
 
 
 def test_too_few_points_and_points_on_a_line(tmp_path):
@@ -193,11 +193,11 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
     with pytest.raises(BadInput, match="9 of its 9 points are marked .* 3 are needed besides 7 --checkpoints"):
         read_ground(tmp_path / "gcp_list.txt", "auto", SIZES, 7)
     found = place_by_points(model(), ground, 7)
-    assert isinstance(found, Refused) and "3 are needed besides 7 checkpoints" in found.reason
+    assert isinstance(found, NoSimilarity) and "3 are needed besides 7 checkpoints" in found.reason
     line = [np.array([at, 2 * at, 0.1 * at]) - 3 for at in range(4)]
     points = [type(ground.points[0])(f"P{at}", tuple(xyz), pixels(xyz)) for at, xyz in enumerate(line)]
     found = place_by_points(model(), type(ground)(points, ground.chart, np.stack(line)), 0)
-    assert isinstance(found, Refused) and "line" in found.reason
+    assert isinstance(found, NoSimilarity) and "line" in found.reason
 
 
 @pytest.mark.parametrize(

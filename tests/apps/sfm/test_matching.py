@@ -36,7 +36,9 @@ def test_many_pairs_are_compared_in_few_calls_and_each_once(tmp_path, monkeypatc
     monkeypatch.setattr(matching, "reduced", lambda *given: (0, 0))
     matching.match(photos, pairs, tmp_path, tmp_path / "database.db", Settings(), CPU)
     assert [line for lines in seen for line in lines] == [f"{one}.jpg {two}.jpg" for one, two in pairs]
-    assert len(seen) <= matching.MOST_BATCHES < len(pairs) / matching.BATCH, "each call reads all images"
+    assert len(seen) <= matching.MAX_PROGRESS_BATCHES < len(pairs) / matching.MIN_BATCH_PAIRS, (
+        "each call reads all images"
+    )
     seen.clear()
     matching.match(photos, pairs[:100], tmp_path, tmp_path / "database.db", Settings(), CPU)
     assert [len(lines) for lines in seen] == [40, 40, 20]

@@ -29,7 +29,7 @@ def descriptors(dtype, seed=0):
 @pytest.mark.parametrize("ratio", [0.8, 1.0])
 @pytest.mark.parametrize("at_once", [7, 4096])
 def test_they_are_those_of_all_distances(dtype, ratio, at_once, monkeypatch):
-    monkeypatch.setattr(module, "AT_ONCE", at_once)
+    monkeypatch.setattr(module, "BATCH_DESCRIPTORS", at_once)
     one, two = descriptors(dtype)
     lengths = [values / np.linalg.norm(values.astype(np.float64), axis=1, keepdims=True) for values in (one, two)]
     away = cdist(*lengths)

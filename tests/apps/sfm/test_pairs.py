@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.pairs import SMALL, alike, choose_pairs, distance_seen, facing, in_order, near, sequence, vlad
+from surfkit.apps.sfm.pairs import (
+    MAX_EXHAUSTIVE_PHOTOS,
+    alike,
+    choose_pairs,
+    distance_seen,
+    facing,
+    in_order,
+    near,
+    sequence,
+    vlad,
+)
 from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.settings import Settings
 
@@ -76,7 +86,7 @@ def test_only_photographs_without_a_position_are_compared_by_likeness_besides_gp
 
 
 def test_a_large_set_without_gps_is_compared_by_likeness_and_sequence():
-    count = SMALL + 4
+    count = MAX_EXHAUSTIVE_PHOTOS + 4
     pairs = choose_pairs(photos(count), Settings(neighbours=4), scenes(count, 8))
     assert {(0, 1), (0, 2), (0, 3)} <= set(pairs) and len(pairs) < count * 8
     assert sum((two - one) % 8 == 0 for one, two in pairs) > count

@@ -189,7 +189,10 @@ def test_the_last_bits_of_a_model_are_rounded_away(prepared, tmp_path):
         for point in model.points3D.values():
             point.xyz = shaken(point.xyz)
         mapping.round_off(engine, model)
-        assert max(np.abs(model.points3D[number].xyz - xyz).max() for number, xyz in exact.items()) < mapping.GRAIN
+        assert (
+            max(np.abs(model.points3D[number].xyz - xyz).max() for number, xyz in exact.items())
+            < mapping.MODEL_ROUNDING
+        )
         (tmp_path / name).mkdir()
         model.write_binary(tmp_path / name)
         written.append({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()})

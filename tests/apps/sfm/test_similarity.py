@@ -81,7 +81,7 @@ def test_of_many_positions_a_part_is_searched_and_all_decide(monkeypatch):
     fit = fit_robustly(xyz, onto)
     assert (fit.inside == ~wrong).mean() > 0.998 and not fit.inside[wrong].any()
     same(fit.similarity, truth, 1e-3)
-    assert sum(count > similarity.MOST for count in seen) <= similarity.ROUNDS
+    assert sum(count > similarity.MAX_CONSENSUS_POSITIONS for count in seen) <= similarity.CONCENTRATION_STEPS
 
 
 def test_the_same_draws_give_the_same_bits():

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.georeference import Placement, Refused
+from surfkit.apps.sfm.georeference import NoSimilarity, Placement
 from surfkit.apps.sfm.level import up_of
 from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import Hand, upside_down
+from surfkit.apps.sfm.plausible import Handedness, upside_down
 from surfkit.apps.sfm.positions import Positions
 from surfkit.apps.sfm.site import decide, heights_named, locate, readings
 from surfkit.core.check import BadInput
@@ -50,7 +50,7 @@ def decided(photos, crs="auto", given=None):
     with collect_notes() as notes:
         choices = readings(positions, crs)
         chosen = decide(given, choices, positions, 0)
-        found = locate(given, chosen, 0) if not isinstance(chosen, Refused) else chosen
+        found = locate(given, chosen, 0) if not isinstance(chosen, NoSimilarity) else chosen
     return found, notes.texts
 
 
@@ -68,7 +68,7 @@ def test_one_missing_letter_is_decided_by_the_cameras(letters, heights):
 
 def test_without_both_letters_half_a_turn_is_left_open_unless_a_system_decides():
     found, said = decided(photographs(""))
-    assert isinstance(found, Refused) and said == []
+    assert isinstance(found, NoSimilarity) and said == []
     assert "N 151.19" in found.reason and "S 151.19" in found.reason and "fit alike" in found.reason
     assert "W" in found.reason.split("S 151.19")[0], "north-west, half a turn from south-east"
     found, said = decided(photographs(""), "EPSG:32756")
@@ -81,14 +81,14 @@ def test_without_both_letters_half_a_turn_is_left_open_unless_a_system_decides()
 
 def test_a_wrong_letter_is_refused():
     found, _ = decided(photographs(east=-1.0))
-    assert isinstance(found, Refused)
+    assert isinstance(found, NoSimilarity)
     assert "upside down, 40 m below the ground, with a mean direction of view 90 degrees above" in found.reason
 
 
 def test_cameras_that_fit_no_sign():
     wrong = photographs("S", centres=RNG.uniform(-60, 60, (20, 3)))
     found, _ = decided(wrong)
-    assert isinstance(found, Refused) and "no sign fits (" in found.reason
+    assert isinstance(found, NoSimilarity) and "no sign fits (" in found.reason
 
 
 def test_in_plan_heights_are_above_the_middle_of_the_ground():
@@ -139,12 +139,12 @@ def test_a_tower_seen_from_its_foot_is_no_mistake():
 
 def test_mirrored_places():
     xyz = RNG.uniform(-5, 5, (9, 3))
-    hand = Hand.of(xyz, 3 * xyz @ TURN.T, 0.1)
+    hand = Handedness.of(xyz, 3 * xyz @ TURN.T, 0.1)
     assert hand.right and not hand.wrong
-    hand = Hand.of(xyz, 3 * (xyz * (1, 1, -1)) @ TURN.T + 7, 0.1)
+    hand = Handedness.of(xyz, 3 * (xyz * (1, 1, -1)) @ TURN.T + 7, 0.1)
     assert hand.wrong and not hand.right and hand.plain > 1 and hand.mirrored < 1e-9
     flat = xyz * (1, 1, 0)
-    hand = Hand.of(flat, flat * (1, -1, 1) + RNG.normal(0, 0.3, (9, 3)), 0.1)
+    hand = Handedness.of(flat, flat * (1, -1, 1) + RNG.normal(0, 0.3, (9, 3)), 0.1)
     assert not hand.wrong and not hand.right, "of a plane nobody can tell"
 
 
@@ -154,7 +154,7 @@ def test_heights_that_count_down_are_found_out_where_they_vary():
     found, _ = decided(photographs(centres=rough), given=given)
     assert isinstance(found, Placement) and found.handed
     found, _ = decided(photographs(centres=rough * (1, 1, -1)), given=given)
-    assert isinstance(found, Refused) and "positions fit mirrored only, to 0.00 m for" in found.reason
+    assert isinstance(found, NoSimilarity) and "positions fit mirrored only, to 0.00 m for" in found.reason
 
 
 @pytest.mark.parametrize(

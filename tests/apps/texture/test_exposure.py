@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surfkit.apps.texture.candidates import NONE, Candidates
-from surfkit.apps.texture.exposure import KNEE, MOST, PRIOR, exposed, exposure_gains, levelled
+from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
+from surfkit.apps.texture.exposure import GAIN_SIGMA, KNEE, MAX_GAIN, exposed, exposure_gains, levelled
 
 
 def strip(exposures, slope=0.0, each=60):
@@ -24,18 +24,18 @@ def test_gains_bring_all_to_the_median_exposure():
     gains = exposure_gains(*strip(exposures), len(exposures))
     assert np.abs(gains * exposures[:, None] - 1).max() < 0.04
     most = exposure_gains(*strip(np.r_[exposures, 0.3]), 10)  # one that is out of all bounds moves no other
-    assert np.abs(most[:9] / gains - 1).max() < 0.08 and most.max() <= MOST
+    assert np.abs(most[:9] / gains - 1).max() < 0.08 and most.max() <= MAX_GAIN
 
 
 def test_a_slope_in_every_photograph_does_not_add_up_along_a_strip():
     """4 % from side to side: by ratios alone, the last of 40 photographs would be brightened 4.7 times as the first."""
     gains = exposure_gains(*strip(np.ones(40), slope=0.04), 40)
-    assert np.abs(np.log(gains)).max() < PRIOR and np.abs(np.log(gains[10:30])).max() < 0.02
+    assert np.abs(np.log(gains)).max() < GAIN_SIGMA and np.abs(np.log(gains[10:30])).max() < 0.02
 
 
 def test_photographs_that_share_nothing_stay_as_they_are():
     shown, color = strip([0.8, 1.0, 1.25])
-    gains = exposure_gains(np.where(shown == 2, NONE, shown), color, 4)
+    gains = exposure_gains(np.where(shown == 2, NO_PHOTO, shown), color, 4)
     assert (gains[2:] == 1).all() and np.allclose(gains[0] / gains[1], 1.25, rtol=0.02)
 
 

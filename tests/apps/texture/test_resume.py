@@ -10,8 +10,8 @@ from needs import needs
 from town import town
 
 from surfkit.apps.texture import deliver, make
-from surfkit.apps.texture.keep import Kept
-from surfkit.apps.texture.make import RECORD, WORK, Subject, TextureSettings, make_texture
+from surfkit.apps.texture.keep import TextureCache
+from surfkit.apps.texture.make import TEXTURE_RECORD, UNFINISHED_SUFFIX, MeshWithPhotos, TextureSettings, make_texture
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped
 from surfkit.core.lock import locked
@@ -24,13 +24,13 @@ SETTINGS = TextureSettings(size=128)
 def scene(tmp_path, monkeypatch):
     """A town; what is seen is kept after every photograph."""
     monkeypatch.setattr(make, "PAUSE_S", 0.0)
-    monkeypatch.setattr(make, "SHARE", 0.0)
+    monkeypatch.setattr(make, "SAVE_PAUSE_FACTOR", 0.0)
     (tmp_path / "photographs").mkdir()
     return town(tmp_path / "photographs")
 
 
 def made(scene, out, settings=SETTINGS):
-    return make_texture(Subject(scene.surface, scene.frame, scene.views), settings, out, 10**8)
+    return make_texture(MeshWithPhotos(scene.surface, scene.frame, scene.views), settings, out, 10**8)
 
 
 def counted(monkeypatch, module, name):
@@ -42,8 +42,8 @@ def counted(monkeypatch, module, name):
 
 def without_seconds(folder):
     """Digests of the files, and the record without the time that it took."""
-    record = json.loads((folder / RECORD).read_text())
-    return {name: value for name, value in digests(folder).items() if name != RECORD} | record | {"seconds": 0}
+    record = json.loads((folder / TEXTURE_RECORD).read_text())
+    return {name: value for name, value in digests(folder).items() if name != TEXTURE_RECORD} | record | {"seconds": 0}
 
 
 def test_the_same_bytes_after_an_interruption_anywhere(scene, tmp_path, monkeypatch):
@@ -65,7 +65,7 @@ def stopped(monkeypatch, scene, out, settings):
         change.setattr(make, "level", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             made(scene, out, settings)
-    assert not out.exists() and (out.with_name(out.name + WORK) / "chosen-0.npz").exists()
+    assert not out.exists() and (out.with_name(out.name + UNFINISHED_SUFFIX) / "chosen-0.npz").exists()
 
 
 @pytest.mark.parametrize("what", ["nothing", "setting", "mesh", "photograph", "damage"])
@@ -79,14 +79,14 @@ def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
     elif what == "photograph":
         os.utime(scene.views[3].path, ns=(1, 1))
     elif what == "damage":
-        file = out.with_name(out.name + WORK) / "chosen-0.npz"
+        file = out.with_name(out.name + UNFINISHED_SUFFIX) / "chosen-0.npz"
         file.write_bytes(file.read_bytes()[:-100])
     looks = counted(monkeypatch, make, "sight")
     monkeypatch.setattr("surfkit.core.stages.emit", said.append)
     made(scene, out, settings)
     assert len(looks) == (0 if what == "nothing" else len(scene.views))
     assert len(said) == (what in ("setting", "mesh", "photograph"))
-    assert (out / RECORD).exists() and not out.with_name(out.name + WORK).exists()
+    assert (out / TEXTURE_RECORD).exists() and not out.with_name(out.name + UNFINISHED_SUFFIX).exists()
 
 
 def test_a_photograph_that_is_gone_is_passed_over(scene, tmp_path, monkeypatch):
@@ -98,12 +98,12 @@ def test_a_photograph_that_is_gone_is_passed_over(scene, tmp_path, monkeypatch):
 
 
 def test_a_second_process_is_refused(scene, tmp_path):
-    with locked(tmp_path / f"out{WORK}"), pytest.raises(BadInput, match="works in it"):
+    with locked(tmp_path / f"out{UNFINISHED_SUFFIX}"), pytest.raises(BadInput, match="works in it"):
         made(scene, tmp_path / "out")
 
 
 def test_arrays_are_kept_whole_or_not_at_all(tmp_path):
-    kept = Kept(tmp_path)
+    kept = TextureCache(tmp_path)
     assert kept.read("a") is None and kept.once("a", lambda: {"x": [1, 2]})["x"].tolist() == [1, 2]
     assert kept.once("a", lambda: pytest.fail("it is there"))["x"].tolist() == [1, 2]
     assert kept.of(1).read("a") is None
@@ -112,4 +112,4 @@ def test_arrays_are_kept_whole_or_not_at_all(tmp_path):
     content[content.index(b"\x01\0\0\0\0\0\0\0\x02")] = 5
     file.write_bytes(content)
     assert kept.read("a") is None, "a digest in the file tells"
-    assert Kept().once("a", lambda: {"x": [3]})["x"].tolist() == [3]
+    assert TextureCache().once("a", lambda: {"x": [3]})["x"].tolist() == [3]

@@ -13,20 +13,28 @@ from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on
 
 from surfkit.apps.texture import exposure, make, pieces
 from surfkit.apps.texture import level as leveling
-from surfkit.apps.texture.candidates import NONE, Candidates
+from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.charts import make_atlas, packed, texels_of
 from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.exposure import exposure_gains
 from surfkit.apps.texture.fill import paint
 from surfkit.apps.texture.look import look, look_in_numpy, project, sight
-from surfkit.apps.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture, textured
-from surfkit.apps.texture.photographs import Photographs
-from surfkit.apps.texture.pieces import Pieces
+from surfkit.apps.texture.make import (
+    MeshWithPhotos,
+    TextureSettings,
+    lay_out,
+    local_mesh,
+    look_at_all,
+    make_texture,
+    textured,
+)
+from surfkit.apps.texture.photographs import PrefetchedPhotos
+from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.regions import divide, middles
 from surfkit.apps.texture.topology import neighbours, with_short_edges
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, Warned
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import SurfaceFile
 from surfkit.io.glb import read_glb
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
@@ -41,7 +49,7 @@ PNG = TextureSettings(triangles=100_000, pictures="png", size=1024)
 
 
 def made(scene, out, settings=PNG):
-    return make_texture(Subject(scene.surface, scene.frame, scene.views), settings, out, 10**8)
+    return make_texture(MeshWithPhotos(scene.surface, scene.frame, scene.views), settings, out, 10**8)
 
 
 def read_pieces(path):
@@ -140,17 +148,17 @@ def test_a_car_in_every_photograph_would_be_there(tmp_path):
     """The tests above can fail: without the refusal of outliers, the photograph with the car is chosen somewhere."""
     scene = town(tmp_path, car=3)
     mesh = local_mesh(scene.surface, scene.frame)
-    photos = Photographs(scene.views, 10**8)
+    photos = PrefetchedPhotos(scene.views, 10**8)
     found = Candidates(len(mesh.faces))
     for number, view in enumerate(scene.views):
         found.offer(number, sight(mesh, view.camera, photos(number)))
-    yellow = (np.abs(found.color - 255 * YELLOW).max(2) < 40) & (found.view != NONE)
+    yellow = (np.abs(found.color - 255 * YELLOW).max(2) < 40) & (found.view != NO_PHOTO)
     assert yellow.sum() > 4 and (found.view[yellow] == 3).all()
     before = yellow & (found.quality == found.quality.max(1, keepdims=True))
     assert before.any(), "it is the best photograph of some triangles"
     found.refuse_outliers(np.ones((len(scene.views), 3)))
     assert not (found.view[yellow] == 3).any()
-    assert (found.view != NONE).any(1).mean() > 0.85, "others are left"
+    assert (found.view != NO_PHOTO).any(1).mean() > 0.85, "others are left"
 
 
 def test_what_no_photograph_shows_has_the_colors_of_the_vertices(plain):
@@ -167,7 +175,7 @@ def test_sight_is_what_rays_see(tmp_path):
     places = np.einsum("nk,fki->fni", shares, scene.surface.vertices(scene.surface.faces.ravel()).reshape(-1, 3, 3))
     for number in (0, 5, 9):
         view = scene.views[number]
-        found = sight(mesh, view.camera, Photographs(scene.views, 10**8)(number))
+        found = sight(mesh, view.camera, PrefetchedPhotos(scene.views, 10**8)(number))
         share = is_seen(places.reshape(-1, 3), [number])[number].reshape(-1, 60).mean(1)
         told = np.zeros(len(share), bool)
         told[found.faces] = True
@@ -207,11 +215,11 @@ def test_what_lies_beside_an_outline_counts_less():
 
 def test_corrections_are_linear_between_vertices(tmp_path):
     scene = town(tmp_path)
-    made_of = textured(Subject(scene.surface, scene.frame, scene.views), PNG, 10**8)
+    made_of = textured(MeshWithPhotos(scene.surface, scene.frame, scene.views), PNG, 10**8)
     mesh, atlas = made_of.paint.mesh, made_of.paint.atlas
     levels = made_of.paint.levels
     value = np.zeros((len(levels.value), 3), np.float32)
-    seen = atlas.view != NONE
+    seen = atlas.view != NO_PHOTO
     value[levels.corner[seen].ravel()] = mesh.vertices[mesh.faces[seen].ravel()][:, :1] / 3
     page = np.flatnonzero(atlas.page[atlas.chart] == 0)
     before, after = (
@@ -233,7 +241,7 @@ def test_corrections_are_linear_between_vertices(tmp_path):
 def test_the_kernel_counts_as_numpy_does(tmp_path):
     scene = town(tmp_path, cell=0.13)
     mesh, view = local_mesh(scene.surface, scene.frame), scene.views[6]
-    places, photo = project(mesh.vertices, view.camera), Photographs(scene.views, 10**8)(6)
+    places, photo = project(mesh.vertices, view.camera), PrefetchedPhotos(scene.views, 10**8)(6)
     depth, _ = draw_faces(places, mesh.faces, view.camera.width, view.camera.height)
     depth[:40] = 0  # a mask
     ours = look(places, mesh.faces, photo, depth, 0.01)
@@ -248,7 +256,7 @@ def test_the_kernel_counts_as_numpy_does(tmp_path):
 def test_exposures_are_found_and_seams_levelled(tmp_path):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures)
-    mesh, photos = local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8)
+    mesh, photos = local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8)
     found, gains, _ = look_at_all(mesh, photos, 1000)
     wanted = np.median(exposures) / exposures
     assert np.abs(gains / wanted[:, None] - 1).max() < 0.02
@@ -395,22 +403,22 @@ def test_neighbours_get_the_same_photograph():
     found.quality[:, 0] = np.where(left, 1.0, 0.05)
     found.quality[:, 1] = np.where(left, 0.05, 1.0)
     assert (choose_views(found, beyond, edge) == np.where(left, 5, 7)).all()
-    found.view[3] = NONE
+    found.view[3] = NO_PHOTO
     found.quality[3] = 0
-    assert np.flatnonzero(choose_views(found, beyond, edge) == NONE).tolist() == [3]
+    assert np.flatnonzero(choose_views(found, beyond, edge) == NO_PHOTO).tolist() == [3]
 
 
 def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
     """Small pieces give what one large one does; of a flight over a long strip, each photograph shows few of them."""
     scene = town(tmp_path, cell=0.25)
-    mesh, photos = local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8)
+    mesh, photos = local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8)
     whole = look_at_all(mesh, photos, 1000)
-    monkeypatch.setattr(pieces, "PIECE", 50)
+    monkeypatch.setattr(pieces, "MAX_PIECE_TRIANGLES", 50)
     parts = look_at_all(mesh, photos, 1000)
     assert (whole[0].view == parts[0].view).all() and (whole[0].quality == parts[0].quality).all()
     assert (whole[0].color == parts[0].color).all() and (whole[1] == parts[1]).all()
     strip, faces = sheet((-100, -1, 0), np.array([200.0, 0, 0]), np.array([0, 2.0, 0]), 0.5)
-    divided = Pieces(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
+    divided = MeshClusters(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
     for x in (-150.0, -99.0, 0.0, 60.0):
         pose = torch.tensor([[1.0, 0, 0, -x], [0, -1, 0, 0], [0, 0, -1, 8], [0, 0, 0, 1]], dtype=torch.float64)
         part, rows = divided.in_view(Camera(pose, 150.0, 150.0, 100.0, 100.0, 200, 200))
@@ -423,8 +431,8 @@ def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
 def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures, cell=0.25)
-    found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8), 1000)
-    monkeypatch.setattr(exposure, "ENOUGH", len(found.view) // 3)
+    found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8), 1000)
+    monkeypatch.setattr(exposure, "MAX_SAMPLED_TRIANGLES", len(found.view) // 3)
     some = exposure_gains(found.view, found.color, 12)
     assert not np.array_equal(some, gains) and np.abs(some / gains - 1).max() < 0.02
 
@@ -432,13 +440,13 @@ def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
 def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch):
     kept, most = [], []
 
-    class Watched(Photographs):
+    class Watched(PrefetchedPhotos):
         def __init__(self, views, budget):
             most.append(sum(each.cache.bytes for each in kept))
             super().__init__(views, budget)
             kept.append(self)
 
-    monkeypatch.setattr(make, "Photographs", Watched)
+    monkeypatch.setattr(make, "PrefetchedPhotos", Watched)
     made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("tiles3d",), size=128))
     assert len(most) > 2 and most == [0] * len(most)
 
@@ -486,7 +494,7 @@ def test_texels_are_no_finer_than_pixels(tmp_path, monkeypatch):
 
 
 def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
-    monkeypatch.setattr("surfkit.io.glb.MOST_BYTES", 20_000)
+    monkeypatch.setattr("surfkit.io.glb.MAX_GLB_BYTES", 20_000)
     told = []
     monkeypatch.setattr("surfkit.apps.texture.deliver.emit", told.append)
     record = made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb", "obj")))
@@ -508,8 +516,8 @@ def test_masks_hide(tmp_path):
         masks.append(tmp_path / f"mask-{at}.png")
         Image.fromarray(mask).save(masks[-1])
     some = [replace(view, mask=Mask(masks[at % 2])) for at, view in enumerate(scene.views)]
-    found, _, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(some, 10**8), 1000)
-    assert set(np.unique(found.view)) == {NONE, 1, 3, 5, 7, 9, 11}
+    found, _, _ = look_at_all(local_mesh(scene.surface, scene.frame), PrefetchedPhotos(some, 10**8), 1000)
+    assert set(np.unique(found.view)) == {NO_PHOTO, 1, 3, 5, 7, 9, 11}
     hidden = replace(scene, views=tuple(replace(view, mask=Mask(masks[0])) for view in scene.views))
     record = made(hidden, tmp_path / "out", replace(PNG, formats=("glb",)))
     assert record["seen"] == 0 and record["photographs"] == 0
@@ -522,7 +530,7 @@ def test_vertices_that_are_not_finite_are_left_out(tmp_path):
     scene = town(tmp_path)
     rows = np.concatenate([scene.surface.rows[:1], scene.surface.rows])
     rows["x"][0] = np.nan
-    odd = replace(scene, surface=Surface("mesh.ply", rows, scene.surface.faces + 1))
+    odd = replace(scene, surface=SurfaceFile("mesh.ply", rows, scene.surface.faces + 1))
     settings = replace(PNG, formats=("obj",), triangles=200)
     for each, out in ((scene, "plain"), (odd, "odd")):
         made(each, tmp_path / out, settings)

@@ -6,9 +6,9 @@ import time
 import numpy as np
 import pytest
 
-from surfkit.apps.view.control import Control
-from surfkit.apps.view.follow import Follower, History, journals, newest_pictures, running_blocks
-from surfkit.apps.view.live_panel import ALONE, ELSEWHERE, NOTHING, in_words
+from surfkit.apps.view.control import TrainingControl
+from surfkit.apps.view.follow import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
+from surfkit.apps.view.live_panel import ELSEWHERE, NO_STEPS, OPAQUE_METHOD, in_words
 from surfkit.core.codec import dump
 from surfkit.core.events import Measured, StageBegan, StepDone, emit
 from surfkit.runs.execute.state import BlockState, state_path
@@ -20,7 +20,7 @@ def step(index, **losses):
 
 
 def test_a_journal_is_read_piece_by_piece(tmp_path):
-    follower = Follower(tmp_path)
+    follower = JournalFollower(tmp_path)
     assert not follower.read() and follower.history.index == 0
     with record_events(tmp_path):
         emit(StageBegan("pretrain", 40, 100))
@@ -38,7 +38,7 @@ def test_a_journal_is_read_piece_by_piece(tmp_path):
 
 
 def test_a_line_that_is_being_written_is_read_when_it_is_whole(tmp_path):
-    follower, path = Follower(tmp_path), tmp_path / "events.jsonl"
+    follower, path = JournalFollower(tmp_path), tmp_path / "events.jsonl"
     line = json.dumps({"event": "StepDone", "time": 1.0, "index": 7, "steps": 9, "losses": {"l1": 1}, "points": 3})
     path.write_text(line[:20])
     assert not follower.read()
@@ -47,7 +47,7 @@ def test_a_line_that_is_being_written_is_read_when_it_is_whole(tmp_path):
 
 
 def test_steps_that_are_taken_back_are_forgotten(tmp_path):
-    follower = Follower(tmp_path)
+    follower = JournalFollower(tmp_path)
     with record_events(tmp_path):
         emit(StageBegan("pretrain", 40, 100))
         for index in range(1, 9):
@@ -65,7 +65,7 @@ def test_damaged_lines_are_passed_over(tmp_path):
     bad = ["{\n", '{"event": "StepDone", "time": 1, "index": 1}\n', '{"event": "Measured", "time": 1, "index": 1}\n']
     bad += ['{"event": "StepDone", "time": 1, "index": 2, "steps": 9, "losses": [1], "points": 3}\n', "\0\xff\n"]
     (tmp_path / "events.jsonl").write_text("".join(bad) + good)
-    follower = Follower(tmp_path)
+    follower = JournalFollower(tmp_path)
     assert follower.read() and len(follower.history.rows) == 1
 
 
@@ -88,21 +88,21 @@ def test_blocks_of_other_processes(tmp_path):
     assert found["block 10"] == folder and set(found) == {"whole scene", "block 2", "block 10", "block 11"}
     running = running_blocks(tmp_path)
     assert list(running) == [10]
-    said = in_words(History(), None, running, Control())
+    said = in_words(StageHistory(), None, running, TrainingControl())
     assert said.startswith(ELSEWHERE) and "block 10: step 1,234 of 5,000" in said
     state_path(folder).write_text("{")
     assert not running_blocks(tmp_path)
-    assert in_words(History(), None, {}, Control()) == NOTHING
+    assert in_words(StageHistory(), None, {}, TrainingControl()) == NO_STEPS
 
 
 def test_a_method_that_makes_its_own_steps():
-    history = History("field", 10, 0, [time.time()], [(7, {"sdf": 0.5})])
-    said = in_words(history, None, {}, Control())
-    assert said == f"**field** step 7 of 10, loss 0.5000\n\n{ALONE}"
+    history = StageHistory("field", 10, 0, [time.time()], [(7, {"sdf": 0.5})])
+    said = in_words(history, None, {}, TrainingControl())
+    assert said == f"**field** step 7 of 10, loss 0.5000\n\n{OPAQUE_METHOD}"
     history.times[-1] -= 1000
-    assert in_words(history, None, {}, Control()).startswith(NOTHING)
+    assert in_words(history, None, {}, TrainingControl()).startswith(NO_STEPS)
     history.times[-1], history.steps = time.time(), 7
-    assert in_words(history, None, {}, Control()).startswith(NOTHING)
+    assert in_words(history, None, {}, TrainingControl()).startswith(NO_STEPS)
 
 
 def test_the_last_pictures(tmp_path):
@@ -115,7 +115,7 @@ def test_the_last_pictures(tmp_path):
 
 @pytest.mark.parametrize("count", [2, 5000])
 def test_curves_have_few_dots(count):
-    history = History()
+    history = StageHistory()
     for index in range(1, count + 1):
         history.rows.append((index, {"l1": float(index)}))
     lines = history.losses()
@@ -124,5 +124,9 @@ def test_curves_have_few_dots(count):
 
 
 def test_the_speed_is_that_of_the_last_steps():
-    history = History(times=[0.0, 100.0, *np.arange(200, 210, 0.5)])
-    assert history.speed == 2.0 and History(times=[1.0]).speed is None and History(times=[1.0, 1.0]).speed is None
+    history = StageHistory(times=[0.0, 100.0, *np.arange(200, 210, 0.5)])
+    assert (
+        history.speed == 2.0
+        and StageHistory(times=[1.0]).speed is None
+        and StageHistory(times=[1.0, 1.0]).speed is None
+    )

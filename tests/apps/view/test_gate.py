@@ -10,29 +10,29 @@ import pytest
 from browser import get
 from needs import needs
 
-from surfkit.apps.view.gate import Asked, Gate
+from surfkit.apps.view.gate import AuthRequest, TokenAuth
 from surfkit.apps.view.server import Address, listen, served
 from surfkit.core.check import BadInput
 
-GATE = Gate("right", 8080)
+GATE = TokenAuth("right", 8080)
 OURS = "/surfkit/script.js", "/surfkit/ask?client=0&x=0&y=0"
 
 
 @pytest.mark.parametrize(
     "asked",
     [
-        Asked("/"),
-        Asked("/?token="),
-        Asked("/?token=wrong"),
-        Asked("/?Token=right"),
-        Asked("/right"),
-        Asked("/", cookies=["surfkit-view-8080=wrong"]),
-        Asked("/", cookies=["surfkit-view-8081=right"]),
-        Asked("/", cookies=["=;;,\x00"]),
-        Asked("/?token=r%FFght"),
-        Asked("/?token=right", origins=["http://evil.example"], hosts=["127.0.0.1:8080"]),
-        Asked("/", ["surfkit-view-8080=right"], ["http://127.0.0.1:9000"], ["127.0.0.1:8080"]),
-        Asked("/", ["surfkit-view-8080=right"], ["null"], ["127.0.0.1:8080"]),
+        AuthRequest("/"),
+        AuthRequest("/?token="),
+        AuthRequest("/?token=wrong"),
+        AuthRequest("/?Token=right"),
+        AuthRequest("/right"),
+        AuthRequest("/", cookies=["surfkit-view-8080=wrong"]),
+        AuthRequest("/", cookies=["surfkit-view-8081=right"]),
+        AuthRequest("/", cookies=["=;;,\x00"]),
+        AuthRequest("/?token=r%FFght"),
+        AuthRequest("/?token=right", origins=["http://evil.example"], hosts=["127.0.0.1:8080"]),
+        AuthRequest("/", ["surfkit-view-8080=right"], ["http://127.0.0.1:9000"], ["127.0.0.1:8080"]),
+        AuthRequest("/", ["surfkit-view-8080=right"], ["null"], ["127.0.0.1:8080"]),
     ],
 )
 def test_who_lacks_the_token_is_refused(asked):
@@ -42,10 +42,10 @@ def test_who_lacks_the_token_is_refused(asked):
 @pytest.mark.parametrize(
     "asked",
     [
-        Asked("/?token=right"),
-        Asked("/?a=1&token=wrong&token=right"),
-        Asked("/x", cookies=["other=1", "a=b; surfkit-view-8080=right"]),
-        Asked("/", ["surfkit-view-8080=right"], ["http://127.0.0.1:8080"], ["127.0.0.1:8080"]),
+        AuthRequest("/?token=right"),
+        AuthRequest("/?a=1&token=wrong&token=right"),
+        AuthRequest("/x", cookies=["other=1", "a=b; surfkit-view-8080=right"]),
+        AuthRequest("/", ["surfkit-view-8080=right"], ["http://127.0.0.1:8080"], ["127.0.0.1:8080"]),
     ],
 )
 def test_who_has_the_token_is_admitted(asked):

@@ -19,11 +19,11 @@ from models import data_set
 from needs import needs, needs_native
 
 from surfkit.apps.view import live
-from surfkit.apps.view.control import Control
+from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.live import live_view, rest
-from surfkit.apps.view.live_page import Surroundings
+from surfkit.apps.view.live_page import SceneWithoutModel
 from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.on_page import GREY, OnPage, framed, window_of
+from surfkit.apps.view.on_page import BESIDE_GREY, FramedPictures, framed, window_of
 from surfkit.apps.view.picking import surface_depth
 from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, listen
@@ -42,7 +42,7 @@ from surfkit.runs.stage import Intervals
 from surfkit.train import checkpoint
 from surfkit.train.refine import PruneAndRecover
 from surfkit.train.state import StageState
-from surfkit.train.views import Order
+from surfkit.train.views import ViewOrder
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 
 STEPS = 24
@@ -163,7 +163,7 @@ def test_a_watcher_that_fails_is_not_asked_again(data, recipe, tmp_path, capsys,
 
 
 def test_time_in_which_the_clock_is_stopped_does_not_count(clock):
-    state = StageState(Points.fresh({}, {}), Order(1), torch.Generator())
+    state = StageState(Points.fresh({}, {}), ViewOrder(1), torch.Generator())
     watch = Stopwatch(state)
     with watch.stopped():
         clock.added += 3600
@@ -216,7 +216,7 @@ class Training:
 
 
 def test_what_is_ordered_is_drawn_between_two_steps(scene, tmp_path):
-    control, view = Control(), scene.train[0]
+    control, view = TrainingControl(), scene.train[0]
     with pytest.raises(BadInput, match="no step is being made"):
         control.draw(view, True)
     with Training(control, scene, tmp_path) as training:
@@ -233,7 +233,7 @@ def test_what_is_ordered_is_drawn_between_two_steps(scene, tmp_path):
 
 
 def test_an_order_that_comes_too_late_is_given_back(scene, tmp_path):
-    control = Control()
+    control = TrainingControl()
     control.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
 
     def end():
@@ -248,7 +248,7 @@ def test_an_order_that_comes_too_late_is_given_back(scene, tmp_path):
 
 
 def test_a_pause_holds_the_training_and_pictures_go_on(scene, tmp_path, capsys):
-    control = Control()
+    control = TrainingControl()
     with Training(control, scene, tmp_path) as training:
         control.pause(True)
         at = control.draw(scene.train[0], False).index  # of the step after which it waits
@@ -266,7 +266,7 @@ def test_a_pause_holds_the_training_and_pictures_go_on(scene, tmp_path, capsys):
 
 
 def test_psnr_of_steps_that_are_made_again(scene, tmp_path):
-    control = Control()
+    control = TrainingControl()
     control.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
     for index, value in ((10, 20.0), (20, 21.0), (25, 1.0), (30, 22.0), (20, 23.0)):
         control.look(index, value)
@@ -382,12 +382,12 @@ def test_pixels_of_a_window_show_the_places_that_are_drawn_there(scene, count, a
     rows, columns = np.indices(depth.shape)
     image = np.stack([rows, columns, np.full_like(rows, 200)], 2).astype(np.uint8)
     window = window_of((camera.height, count * camera.width), aspect)
-    whole, page = framed([image] * count, window), OnPage(camera, depth, count, window)
+    whole, page = framed([image] * count, window), FramedPictures(camera, depth, count, window)
     hits = 0
     for row, column in np.stack([draw.integers(0, size, 400) for size in window], 1):
         place = page.place((column + draw.uniform(0, 1)) / window[1], (row + draw.uniform(0, 1)) / window[0])
         at, across, kind = whole[row, column].tolist()
-        if kind == GREY or not depth[at, across] > 0:
+        if kind == BESIDE_GREY or not depth[at, across] > 0:
             assert place is None
             continue
         hits += 1
@@ -405,7 +405,7 @@ def slowly(maps):
 
 def test_coordinates_under_the_pointer(scene, tmp_path, monkeypatch):
     needs("viser")
-    up = Surroundings(scene).first[0]
+    up = SceneWithoutModel(scene).first[0]
     with live_view(Address(), 1.0) as page, Training(page.control, scene, tmp_path) as training:
         browser = Browser(page.url)
         browser.wait_for(backgrounds)
@@ -462,10 +462,10 @@ def test_the_page_says_what_fails(scene, tmp_path, capsys, monkeypatch):
 
 
 def test_the_first_view_shows_the_scene(scene):
-    up, at, middle = Surroundings(scene).first
+    up, at, middle = SceneWithoutModel(scene).first
     assert np.isclose(np.linalg.norm(up), 1) and (at - middle) @ up > 0
     alone = replace(scene, train=scene.train[:1], held_out=())
-    assert Surroundings(alone).size > 0 and np.isfinite(np.stack(Surroundings(alone).first)).all()
+    assert SceneWithoutModel(alone).size > 0 and np.isfinite(np.stack(SceneWithoutModel(alone).first)).all()
 
 
 def drive(url, seen):

@@ -12,12 +12,12 @@ import torch
 from browser import Browser, wait_until
 from needs import needs, needs_native
 
-from surfkit.apps.view.by_view import Eye, Levels, Lot, in_places, reach_of, visibility
+from surfkit.apps.view.by_view import LodCamera, LodSplats, SampledSplats, in_places, reach_of, visibility
 from surfkit.apps.view.page import show
-from surfkit.apps.view.screen import REST_S, TICK_S, WORLD, Following, Stand
+from surfkit.apps.view.screen import REST_S, TICK_S, WORLD, BrowserCamera, CameraFollower
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import Shelf
-from surfkit.apps.view.subject import Subject
+from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.subject import ViewerScene
 from surfkit.compress.levels import MergedLevels
 from surfkit.compress.levels.base import LodInput
 from surfkit.io.splats.table import SplatTable
@@ -68,7 +68,7 @@ def in_image(lens, means, near=NEAR):
 def test_what_an_eye_sees_is_what_projects_into_the_image():
     draw = torch.Generator().manual_seed(1)
     means = 3 * torch.randn(4000, 3, generator=draw)
-    eye = Eye(replace(LOW, cx=30.0, cy=40.0), 0.5)
+    eye = LodCamera(replace(LOW, cx=30.0, cy=40.0), 0.5)
     points = torch.full((4000,), 1e-6)
     assert (eye.sees(means, points)[0].numpy() == in_image(eye.camera, means, 0.5)).mean() > 0.999
     reach = 0.5 * torch.rand(4000, generator=draw)
@@ -83,8 +83,8 @@ def test_what_an_eye_sees_is_what_projects_into_the_image():
 
 
 def test_a_lot_keeps_what_the_parts_of_the_image_show():
-    table, eye = field(), Eye(LOW, NEAR)
-    chosen = Lot(table).choose(1000, eye)
+    table, eye = field(), LodCamera(LOW, NEAR)
+    chosen = SampledSplats(table).choose(1000, eye)
     assert len(chosen) == len(chosen.table) == len(np.unique(chosen.ids)) == 1000
     distances = (table.means.double() - LOW.centre).norm(dim=1).numpy()
     seen = in_image(LOW, table.means)
@@ -106,15 +106,17 @@ def test_a_lot_keeps_what_the_parts_of_the_image_show():
     assert 0 < beside.sum() < 150 and not raised[beside].any(), "few beside the image, and none is enlarged into it"
     step = replace(LOW, world_to_camera=LOW.world_to_camera.clone())
     step.world_to_camera[0, 3] += 0.02
-    assert np.isin(Lot(table).choose(1000, Eye(step, NEAR)).ids, chosen.ids).mean() > 0.9, "most are kept"
+    assert np.isin(SampledSplats(table).choose(1000, LodCamera(step, NEAR)).ids, chosen.ids).mean() > 0.9, (
+        "most are kept"
+    )
 
 
 def test_a_lot_for_no_camera():
     table = field(5000)
-    chosen = Lot(table).choose(500)
+    chosen = SampledSplats(table).choose(500)
     total = visibility(table).double().exp().sum()
     assert float(visibility(chosen.table).double().exp().sum()) == pytest.approx(float(total), rel=0.05)
-    for all_of_it in (Lot(table).choose(5000), Lot(table).choose(10**9, Eye(LOW, NEAR))):
+    for all_of_it in (SampledSplats(table).choose(5000), SampledSplats(table).choose(10**9, LodCamera(LOW, NEAR))):
         assert all_of_it.table.means is table.means and np.array_equal(all_of_it.ids, np.arange(5000))
 
 
@@ -133,7 +135,7 @@ def built():
 def test_levels_are_fine_near_the_camera(built):
     _, tree, _ = built
     for budget in (800, 1500):
-        chosen = Levels(tree).choose(budget, Eye(LOW, NEAR))
+        chosen = LodSplats(tree).choose(budget, LodCamera(LOW, NEAR))
         assert budget / 3 < len(chosen) <= budget and len(np.unique(chosen.ids)) == len(chosen) == len(chosen.table)
         starts = np.cumsum([0, *map(len, tree.levels)])
         level = np.searchsorted(starts, chosen.ids, side="right") - 1
@@ -144,8 +146,8 @@ def test_levels_are_fine_near_the_camera(built):
         distance = np.linalg.norm(chosen.table.means.numpy() - LOW.centre.numpy(), axis=1)
         near, far = level[seen & (distance < 1)], level[seen & (distance > 3)]
         assert near.mean() < far.mean() - 0.7, "finer near it"
-    assert Levels(tree).choose(5, Eye(LOW, NEAR)) is None
-    away = Levels(tree).choose(1000, Eye(camera((0.0, -5.0, 0.4), (0.0, -9.0, 0.4)), NEAR))
+    assert LodSplats(tree).choose(5, LodCamera(LOW, NEAR)) is None
+    away = LodSplats(tree).choose(1000, LodCamera(camera((0.0, -5.0, 0.4), (0.0, -9.0, 0.4)), NEAR))
     assert 0 < len(away) <= 1000, "something beside the image, of which nothing is seen"
 
 
@@ -154,7 +156,7 @@ def test_what_is_in_the_image_is_all_there_where_the_budget_allows(built):
     low = camera((0.0, 0.0, 0.4), (0.0, 0.01, 0.0))
     seen = in_image(low, table.means)
     assert 0 < seen.sum() < 200
-    chosen = Levels(tree).choose(900, Eye(low, NEAR))
+    chosen = LodSplats(tree).choose(900, LodCamera(low, NEAR))
     first = chosen.ids[chosen.ids < len(table)]
     assert np.isin(seen.nonzero()[0], tree.order[first]).all()
     assert not in_image(low, chosen.table.means[chosen.ids >= len(table)]).any(), "and nothing that stands for it"
@@ -163,7 +165,7 @@ def test_what_is_in_the_image_is_all_there_where_the_budget_allows(built):
 @needs_native
 def test_it_looks_more_like_the_model_than_one_level_for_all(built):
     table, tree, rasterizer = built
-    subject = Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), table, levels=tree)
+    subject = ViewerScene(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), table, levels=tree)
     without = replace(subject, levels=None)
 
     def drawn(found):
@@ -176,9 +178,9 @@ def test_it_looks_more_like_the_model_than_one_level_for_all(built):
     def psnr(found):
         return -10 * math.log10(float(((drawn(found) - exact) ** 2).mean()))
 
-    budget, eye = 800, Eye(LOW, NEAR)
-    assert psnr(Shelf(subject).for_eye(budget, eye)[0].table) > psnr(Shelf(subject).within(budget)[0]) + 3
-    assert psnr(Shelf(without).for_eye(budget, eye)[0].table) > psnr(Shelf(without).within(budget)[0]) + 2
+    budget, eye = 800, LodCamera(LOW, NEAR)
+    assert psnr(SharedCache(subject).for_eye(budget, eye)[0].table) > psnr(SharedCache(subject).within(budget)[0]) + 3
+    assert psnr(SharedCache(without).for_eye(budget, eye)[0].table) > psnr(SharedCache(without).within(budget)[0]) + 2
 
 
 def test_splats_stay_in_their_places():
@@ -208,7 +210,7 @@ def test_following_a_camera():
         inside.pop()
         told.append(moves)
 
-    following = Following(action)
+    following = CameraFollower(action)
     time.sleep(REST_S + 0.1)
     assert not told, "a camera that does not move is left alone"
     begun = last = time.monotonic()
@@ -234,17 +236,17 @@ def test_following_a_camera():
 
 
 def test_far_and_the_same():
-    here = Stand(Eye(LOW, NEAR), 1.0)
-    assert here.same_as(Stand(Eye(replace(LOW, world_to_camera=LOW.world_to_camera.clone()), NEAR), 2.0))
-    assert not here.same_as(Stand(Eye(replace(LOW, fx=61.0, fy=61.0), NEAR), 1.0))
+    here = BrowserCamera(LodCamera(LOW, NEAR), 1.0)
+    assert here.same_as(BrowserCamera(LodCamera(replace(LOW, world_to_camera=LOW.world_to_camera.clone()), NEAR), 2.0))
+    assert not here.same_as(BrowserCamera(LodCamera(replace(LOW, fx=61.0, fy=61.0), NEAR), 1.0))
     for gone, far in ((0.2, False), (0.3, True)):
-        moved = Stand(Eye(camera((gone, -3.5, 0.4), (gone, -2.0, 0.0)), NEAR), 1.0)
+        moved = BrowserCamera(LodCamera(camera((gone, -3.5, 0.4), (gone, -2.0, 0.0)), NEAR), 1.0)
         assert moved.far_from(here) == far and not moved.same_as(here)
     for degrees, far in ((10, False), (20, True)):
         ahead = 1.5 * math.tan(math.radians(degrees))
         assert (
-            Stand(Eye(camera((0.0, -3.5, 0.4), (ahead, -2.0, 0.4)), NEAR), 1.0).far_from(
-                Stand(Eye(camera((0.0, -3.5, 0.4), (0.0, -2.0, 0.4)), NEAR), 1.0)
+            BrowserCamera(LodCamera(camera((0.0, -3.5, 0.4), (ahead, -2.0, 0.4)), NEAR), 1.0).far_from(
+                BrowserCamera(LodCamera(camera((0.0, -3.5, 0.4), (0.0, -2.0, 0.4)), NEAR), 1.0)
             )
             == far
         )
@@ -256,8 +258,8 @@ def sent(browser):
 
 def test_a_page_follows_its_browser(tmp_path, monkeypatch):
     needs("viser")
-    subject = Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), field(2000))
-    plain, eyes, inside, together, first = Shelf.for_eye, [], [], [], threading.Event()
+    subject = ViewerScene(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), field(2000))
+    plain, eyes, inside, together, first = SharedCache.for_eye, [], [], [], threading.Event()
     before = threading.enumerate()
 
     def slow(self, budget, eye):
@@ -269,9 +271,9 @@ def test_a_page_follows_its_browser(tmp_path, monkeypatch):
         inside.pop()
         return plain(self, budget, eye)
 
-    drawn, made = Shelf.drawn, []
-    monkeypatch.setattr(Shelf, "drawn", lambda *given: made.append(1) or drawn(*given))
-    monkeypatch.setattr(Shelf, "for_eye", slow)
+    drawn, made = SharedCache.drawn, []
+    monkeypatch.setattr(SharedCache, "drawn", lambda *given: made.append(1) or drawn(*given))
+    monkeypatch.setattr(SharedCache, "for_eye", slow)
     with served(Address(), "test") as found:
         show(subject, found, tmp_path, most=500)
         browser = Browser(found.url)

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from surfkit.apps.view.answers import Script, with_script
 from surfkit.apps.view.cursor import Cursor
 from surfkit.apps.view.page import show
-from surfkit.apps.view.picking import Places, hit_points
+from surfkit.apps.view.picking import PointPicker, hit_points
 from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import Points, Subject
+from surfkit.apps.view.subject import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import Frame
@@ -50,7 +50,7 @@ def shown(subject, folder):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    with shown(Subject(Path("plane"), FRAME, UP, mesh=PLANE), tmp_path_factory.mktemp("out")) as found:
+    with shown(ViewerScene(Path("plane"), FRAME, UP, mesh=PLANE), tmp_path_factory.mktemp("out")) as found:
         yield found
 
 
@@ -203,8 +203,11 @@ def test_one_at_a_time_and_the_server_goes_on(tmp_path):
         assert leave.wait()
         return Maps(median=torch.full((1, 1), 2.0))
 
-    points = Points(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
-    with shown(Subject(Path("p"), FRAME, UP, points=points, draw=draw), tmp_path) as page, connected(page) as browser:
+    points = ViewerPoints(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
+    with (
+        shown(ViewerScene(Path("p"), FRAME, UP, points=points, draw=draw), tmp_path) as page,
+        connected(page) as browser,
+    ):
         client, first = tag(browser)[0], []
         thread = threading.Thread(target=lambda: first.append(ask(page, client=client, x=0, y=0)))
         thread.start()
@@ -258,7 +261,7 @@ def test_a_page_of_another_form_works_without_it(capsys):
 
 
 def test_clicks_work_without_it(tmp_path):
-    with shown(Subject(Path("plane"), FRAME, UP, mesh=PLANE), tmp_path) as page:
+    with shown(ViewerScene(Path("plane"), FRAME, UP, mesh=PLANE), tmp_path) as page:
         page.script.missing = True
         with connected(page) as browser:
             assert not any(row.get("label") == "follow the pointer" for row in browser.gui.values())
@@ -272,7 +275,7 @@ def test_points_are_met_by_cells_as_one_by_one():
     xyz = np.concatenate([draw.uniform(-1, 1, (30_000, 3)) * [1, 1, 0.1], draw.normal(0, 9, (50, 3))]).astype(
         np.float32
     )
-    found = Places(xyz)
+    found = PointPicker(xyz)
     assert len(found.starts) > 50
     answers = []
     for origin in draw.normal(0, 2, (60, 3)):
@@ -282,8 +285,10 @@ def test_points_are_met_by_cells_as_one_by_one():
         answers.append((found.hit(origin, direction, spread), hit_points(xyz, origin, direction, spread)))
     assert all((a is None) == (b is None) and (a is None or abs(a - b) < 1e-9) for a, b in answers)
     assert 15 < sum(a is not None for a, _ in answers) < 60
-    assert Places(xyz[:1]).hit(xyz[0] - np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]), 0.01) == pytest.approx(2)
+    assert PointPicker(xyz[:1]).hit(
+        xyz[0] - np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]), 0.01
+    ) == pytest.approx(2)
     far = np.zeros((500, 3), np.float32)
     far[-1] = 1e12
-    assert Places(far).hit(np.array([0.0, 0.0, -2.0]), np.array([0.0, 0.0, 1.0]), 0.01) == pytest.approx(2)
-    assert Places(np.zeros((5, 3), np.float32)).hit(np.ones(3), np.array([1.0, 0.0, 0.0]), 0.01) is None
+    assert PointPicker(far).hit(np.array([0.0, 0.0, -2.0]), np.array([0.0, 0.0, 1.0]), 0.01) == pytest.approx(2)
+    assert PointPicker(np.zeros((5, 3), np.float32)).hit(np.ones(3), np.array([1.0, 0.0, 0.0]), 0.01) is None

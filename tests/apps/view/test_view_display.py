@@ -23,10 +23,10 @@ from surfkit.apps.view.display import (
     some,
 )
 from surfkit.apps.view.glb import unlit_glb
-from surfkit.apps.view.pictures import WORST, error_picture, picture, thumbnail
+from surfkit.apps.view.pictures import WORST_ERROR, error_picture, picture, thumbnail
 from surfkit.apps.view.screen import whole_view
-from surfkit.apps.view.shelf import Shelf
-from surfkit.apps.view.subject import Subject
+from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.subject import ViewerScene
 from surfkit.compress.levels.tree import LodBlock, LodTree
 from surfkit.core.check import BadInput
 from surfkit.io.splats.table import SplatTable
@@ -85,13 +85,13 @@ def test_a_budget_takes_a_level_of_detail_where_there_is_one():
     models = [SplatModel(primitive, primitive.from_table(table(n), torch.Generator())) for n in sizes]
     blocks = [LodBlock(2, 0, 8, -1, 2.0), LodBlock(1, 0, 30, 0, 1.0), LodBlock(0, 0, 100, 1, 0.0)]
     tree = LodTree.of(np.arange(100), models, blocks)
-    subject = Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), table(100), levels=tree)
+    subject = ViewerScene(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), table(100), levels=tree)
     for budget, count, said in ((100, 100, "all 100"), (40, 30, "level of detail 1"), (8, 8, "2 stand for 100")):
-        found, told = Shelf(subject).within(budget)
+        found, told = SharedCache(subject).within(budget)
         assert len(found) == count and said in told
-    found, told = Shelf(subject).within(5)
+    found, told = SharedCache(subject).within(5)
     assert len(found) == 5 and told.startswith("5 splats, drawn by lot")
-    found, told = Shelf(replace(subject, levels=None)).within(40)
+    found, told = SharedCache(replace(subject, levels=None)).within(40)
     assert len(found) == 40 and told.startswith("40 splats, drawn by lot") and "surfkit lod" not in told
 
 
@@ -107,7 +107,7 @@ def test_splats_in_their_places():
 
 def test_covariances_of_a_choice_are_in_the_unit_of_the_model():
     splats = table(300)
-    shelf = Shelf(Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), splats))
+    shelf = SharedCache(ViewerScene(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), splats))
     whole, some_of_it = shelf.drawn(splats, "as trained"), shelf.drawn(splats.take(slice(0, 7)), "as trained")
     assert some_of_it.unit == whole.unit and np.allclose(some_of_it.covariances, whole.covariances[:7])
 
@@ -200,7 +200,7 @@ def test_errors_are_the_differences_to_the_photograph(tmp_path):
     assert "mean 10.0%" in told and "PSNR 20.00 dB" in told and off.sum() > exact.sum()
     assert np.array_equal(picture(view, "error", lambda v: maps(v, 100 / 255 - 0.1), frame)[0], off), "without its sign"
     worst = error_picture(maps(view, 1.0), torch.zeros(3, 30, 40))[0]
-    assert np.array_equal(worst, error_picture(maps(view, WORST), torch.zeros(3, 30, 40))[0])
+    assert np.array_equal(worst, error_picture(maps(view, WORST_ERROR), torch.zeros(3, 30, 40))[0])
 
 
 def test_pictures_of_a_camera(tmp_path):

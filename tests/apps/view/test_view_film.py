@@ -11,12 +11,12 @@ from needs import needs
 from surfkit.apps.view.film import FilmTool
 from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import Points, Subject
+from surfkit.apps.view.subject import ViewerPoints, ViewerScene
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import Frame
 
 FRAME = Frame(np.array([492_000.0, 5_260_000.0, 430.0]), 0.01, 1.0, "EPSG:32632")
-CLOUD = Points(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
+CLOUD = ViewerPoints(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
 FRAMES = 8
 
 
@@ -53,7 +53,7 @@ def path_on_page(drawing, folder):
     """A page with a path of 8 frames upwards, from 0.2 to 0.9 local units."""
     needs("viser"), needs("cv2")
     (folder / "a.ply").write_bytes(b"a model")
-    subject = Subject(folder / "a.ply", FRAME, np.array([0.0, 0.0, 1.0]), points=CLOUD, draw=drawing)
+    subject = ViewerScene(folder / "a.ply", FRAME, np.array([0.0, 0.0, 1.0]), points=CLOUD, draw=drawing)
     with served(Address(), "test") as page:
         drawing.closing = page.closing
         show(subject, page, folder / "out")

@@ -14,7 +14,7 @@ from surfkit.apps.view.keyframes import KeyPath, write_path
 from surfkit.apps.view.layers import frustum_lines
 from surfkit.apps.view.measure import coordinates, decimals, in_words, measured, path_lines, shown
 from surfkit.apps.view.outlines import block_outlines, outline, spread_out
-from surfkit.apps.view.picking import Triangles, corners_of, hit_camera, hit_points, hit_splats
+from surfkit.apps.view.picking import TrianglePicker, corners_of, hit_camera, hit_points, hit_splats
 from surfkit.apps.view.tools import free_name
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
@@ -26,7 +26,7 @@ from surfkit.runs.method import with_drawing
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import read_crop, write_crop
-from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.scene import Frame, Scene, SparsePoints, View
 from surfkit.scene.up_direction import map_axes
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -107,7 +107,7 @@ def soup(count=4000):
 def test_rays_meet_triangles_where_trimesh_says():
     trimesh = needs("trimesh")
     ball = trimesh.creation.icosphere(5, 1.0)
-    found = Triangles(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces))
+    found = TrianglePicker(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces))
     assert len(found.starts) > 10, "in many cells"
     draw = np.random.default_rng(1)
     origins = draw.normal(0, 2, (60, 3))
@@ -131,8 +131,8 @@ def test_rays_meet_triangles_where_trimesh_says():
 
 def test_rays_meet_triangles_in_any_order_of_cells():
     vertices, faces = soup()
-    found = Triangles(vertices, faces)
-    one = Triangles.__new__(Triangles)  # all triangles in one cell
+    found = TrianglePicker(vertices, faces)
+    one = TrianglePicker.__new__(TrianglePicker)  # all triangles in one cell
     one.vertices, one.faces = vertices, faces
     one.starts, one.ends = np.array([0]), np.array([len(faces)])
     one.low, one.high = vertices.min(0)[None], vertices.max(0)[None]
@@ -224,7 +224,7 @@ def test_a_path_is_read_back_by_render(tmp_path):
     keys = cameras(4)
     path = KeyPath([camera.world_to_camera.numpy() for camera in keys], 2.0, 25.0, 50.0)
     assert write_path(tmp_path / "deep" / "path.json", path, FRAME) == 50
-    scene = Scene("s", (View("a", LENS, tmp_path),), (), Cloud(torch.zeros(0, 3), torch.zeros(0, 3)), FRAME)
+    scene = Scene("s", (View("a", LENS, tmp_path),), (), SparsePoints(torch.zeros(0, 3), torch.zeros(0, 3)), FRAME)
     flight = from_file(tmp_path / "deep" / "path.json", scene.frame, LENS, 7)
     assert len(flight.cameras) == 50 and flight.fps == 25
     for at, key in ((0, keys[0]), (-1, keys[-1])):
@@ -275,6 +275,6 @@ def test_outlines_lie_where_the_owner_changes():
 
 def test_an_empty_mesh_is_no_trouble():
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
-    found = Triangles(mesh.vertices, mesh.faces)
+    found = TrianglePicker(mesh.vertices, mesh.faces)
     assert found.hit(np.zeros(3), np.ones(3)) == pytest.approx(1 / 3)
     assert found.hit(np.zeros(3), -np.ones(3)) is None

@@ -11,18 +11,26 @@ import torch
 from browser import Browser, cookie, get
 from needs import needs
 
-from surfkit.apps.view.by_view import Eye, PointLot
-from surfkit.apps.view.pace import AT_REST, FEW, FIRST, LATE_S, LEAST, Limit, numbers
+from surfkit.apps.view.by_view import LodCamera, SampledPoints
+from surfkit.apps.view.pace import (
+    INITIAL_LIMITS,
+    LATE_S,
+    MAX_UNASKED_ITEMS,
+    MIN_LIMITS,
+    REST_FACTOR,
+    DrawLimit,
+    numbers,
+)
 from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import LARGER, Shelf
-from surfkit.apps.view.subject import Points, Subject
+from surfkit.apps.view.shelf import MAX_POINT_ENLARGEMENT, SharedCache
+from surfkit.apps.view.subject import ViewerPoints, ViewerScene
 from surfkit.io.splats.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
-COUNT = 3 * FEW
+COUNT = 3 * MAX_UNASKED_ITEMS
 
 
 class Played:
@@ -30,7 +38,7 @@ class Played:
 
     def __init__(self, fixed, each, wanted=1_000_000, first=None, noise=0.15, seed=0):
         self.fixed, self.each, self.wanted, self.noise = fixed, each, wanted, noise
-        self.limit, self.now, self.draw = Limit(first, 5_000), 0.0, np.random.default_rng(seed)
+        self.limit, self.now, self.draw = DrawLimit(first, 5_000), 0.0, np.random.default_rng(seed)
         self.changes, self.rates = [], []
 
     def takes(self, count):
@@ -95,7 +103,7 @@ def test_a_browser_that_was_slow_for_a_while_gets_everything_again():
 
 
 def test_what_is_no_slowness_limits_nothing():
-    limit = Limit()
+    limit = DrawLimit()
     for now in range(100):
         limit.judge([0.02, 0.02, 3.0, 0.02, 0.02], 1_000_000, 1_000_000, float(now))  # it collects garbage
         limit.judge([0.02, 5.0, 0.02], 1_000_000, 1_000_000, float(now))
@@ -104,29 +112,29 @@ def test_what_is_no_slowness_limits_nothing():
 
 
 def test_the_least_and_the_slider():
-    limit = Limit(least=5_000)
+    limit = DrawLimit(least=5_000)
     for now in range(5):
         limit.judge([9.0, 9.0, 9.0], limit.allowed(10**6, True), 10**6, float(now))
     assert limit.most == 5_000 and limit.allowed(3_000, True) == 3_000
-    assert limit.allowed(10**6, False) == AT_REST * 5_000 and limit.allowed(8_000, False) == 8_000
-    slow = Limit(40_000)
+    assert limit.allowed(10**6, False) == REST_FACTOR * 5_000 and limit.allowed(8_000, False) == 8_000
+    slow = DrawLimit(40_000)
     for now in range(0, 200, 20):  # all of a small number is in time: that tells nothing of a million
         slow.judge([0.001] * 5, 10_000, 10_000, float(now))
     assert slow.allowed(10**6, True) < 400_000
 
 
 def test_pictures_at_rest_are_judged_by_what_moving_ones_would_take():
-    limit = Limit(40_000)
+    limit = DrawLimit(40_000)
     for now in range(50):
-        limit.judge([0.2] * 5, AT_REST * 40_000, 10**6, float(now))
-        limit.judge([0.06] * 5, AT_REST * 40_000, 10**6, float(now))  # of which most may be for what stays
+        limit.judge([0.2] * 5, REST_FACTOR * 40_000, 10**6, float(now))
+        limit.judge([0.06] * 5, REST_FACTOR * 40_000, 10**6, float(now))  # of which most may be for what stays
         assert limit.most == 40_000
-    limit.judge([0.6] * 5, AT_REST * 40_000, 10**6, 60.0)
+    limit.judge([0.6] * 5, REST_FACTOR * 40_000, 10**6, 60.0)
     assert 10_000 < limit.most < 20_000
 
 
 def test_a_limit_that_was_lowered_is_not_raised_at_once():
-    limit = Limit()
+    limit = DrawLimit()
     limit.judge([0.2] * 5, 10**6, 10**6, 0.0)
     lowered = limit.most
     assert lowered == 333_333
@@ -149,20 +157,20 @@ def test_points_near_the_camera_are_more_likely():
     draw = torch.Generator().manual_seed(0)
     xyz = torch.cat([8 * torch.rand(40_000, 2, generator=draw) - 4, torch.full((40_000, 1), 1.0)], 1)
     pose = torch.eye(4, dtype=torch.float64)
-    eye = Eye(Camera(pose, 100.0, 100.0, 50.0, 50.0, 100, 100), 0.01)
-    rows, _ = PointLot(xyz).rows(1000, eye)
+    eye = LodCamera(Camera(pose, 100.0, 100.0, 50.0, 50.0, 100, 100), 0.01)
+    rows, _ = SampledPoints(xyz).rows(1000, eye)
     chosen = xyz[rows]
     inside = (chosen[:, :2].abs() <= 0.55).all(1).float().mean()
     assert len(rows) == len(rows.unique()) == 1000 and inside > 0.6, "that is 2 % of the points"
-    assert PointLot(xyz).rows(999)[0].shape == (999,)
+    assert SampledPoints(xyz).rows(999)[0].shape == (999,)
 
 
 def test_points_that_stand_for_others_cover_as_much():
     draw = np.random.default_rng(0)
     xyz = np.column_stack([draw.uniform(-0.4, 0.4, (4000, 2)), np.full(4000, 1.0)]).astype(np.float32)
-    eye = Eye(Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 50.0, 50.0, 100, 100), 0.01)
-    shelf = Shelf(subject(points=Points(xyz, np.zeros((4000, 3), np.uint8))))
-    for count, exact in ((2000, 2**0.5), (1000, 2.0), (20, LARGER)):
+    eye = LodCamera(Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 50.0, 50.0, 100, 100), 0.01)
+    shelf = SharedCache(subject(points=ViewerPoints(xyz, np.zeros((4000, 3), np.uint8))))
+    for count, exact in ((2000, 2**0.5), (1000, 2.0), (20, MAX_POINT_ENLARGEMENT)):
         rows, larger = shelf.points_for_eye(count, eye)
         assert len(rows) == count and larger == pytest.approx(exact, rel=0.1)
 
@@ -181,12 +189,12 @@ def table(count=COUNT):
 
 
 def subject(**parts):
-    return Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), **parts)
+    return ViewerScene(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), **parts)
 
 
 def points(count=COUNT):
     xyz = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
-    return Points(xyz, np.zeros((count, 3), np.uint8))
+    return ViewerPoints(xyz, np.zeros((count, 3), np.uint8))
 
 
 def tell(page, client, **asked):
@@ -237,7 +245,7 @@ def test_a_browser_without_a_graphics_card_begins_with_few_points_and_gets_as_ma
         looking(page, 1) as (slow, client),
         looking(page, 0) as (fast, other),
     ):
-        assert count_in(slow) in (FIRST["splats as points"], COUNT) and "point_size" in slow.names()["/splats"]
+        assert count_in(slow) in (INITIAL_LIMITS["splats as points"], COUNT) and "point_size" in slow.names()["/splats"]
         slow.wait_for(lambda b: count_in(b) == COUNT)  # at rest, three times as many
         assert says(fast, f"all {COUNT:,} splats") and "buffer" in fast.names()["/splats"]
         told = len(fast.told)
@@ -252,18 +260,18 @@ def test_a_browser_without_a_graphics_card_begins_with_few_points_and_gets_as_ma
 
 
 def test_points_are_fewer_while_the_camera_moves(tmp_path):
-    total, first = 10 * COUNT, FIRST["points"]
+    total, first = 10 * COUNT, INITIAL_LIMITS["points"]
     with shown(subject(points=points(total)), tmp_path) as page, looking(page, 1) as (browser, client):
-        browser.wait_for(lambda b: count_in(b) == AT_REST * first)
-        assert says(browser, f"{AT_REST * first:,} of {total:,} points are shown. This browser draws slowly")
+        browser.wait_for(lambda b: count_in(b) == REST_FACTOR * first)
+        assert says(browser, f"{REST_FACTOR * first:,} of {total:,} points are shown. This browser draws slowly")
         tell(page, client, software=1, ms="900,900,900,900,900", drawn=first)  # what it had before
         browser.stand(5.0)
         browser.wait_for(lambda b: count_in(b) == first)
-        browser.wait_for(lambda b: count_in(b) == AT_REST * first)
+        browser.wait_for(lambda b: count_in(b) == REST_FACTOR * first)
         for times in ("900,900", "900"):  # three that took more than a second are enough
-            assert count_in(browser) == AT_REST * first
-            tell(page, client, software=1, ms=times, drawn=AT_REST * first)
-        browser.wait_for(lambda b: 0 < count_in(b) < AT_REST * first / 2)
+            assert count_in(browser) == REST_FACTOR * first
+            tell(page, client, software=1, ms=times, drawn=REST_FACTOR * first)
+        browser.wait_for(lambda b: 0 < count_in(b) < REST_FACTOR * first / 2)
 
 
 def test_a_mesh_keeps_pace_too(tmp_path):
@@ -275,9 +283,9 @@ def test_a_mesh_keeps_pace_too(tmp_path):
     mesh = Mesh(places, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
     with shown(subject(mesh=mesh), tmp_path) as page, looking(page, 1) as (browser, client):
         first = count_in(browser)
-        assert FIRST["triangles"] / 3 < first <= FIRST["triangles"] and says(browser, "draws slowly")
+        assert INITIAL_LIMITS["triangles"] / 3 < first <= INITIAL_LIMITS["triangles"] and says(browser, "draws slowly")
         tell(page, client, software=1, ms="300,300,300,300,300", drawn=3 * first)
-        browser.wait_for(lambda b: LEAST["triangles"] / 3 < count_in(b) <= LEAST["triangles"])
+        browser.wait_for(lambda b: MIN_LIMITS["triangles"] / 3 < count_in(b) <= MIN_LIMITS["triangles"])
 
 
 def test_without_a_word_from_the_browser_nothing_is_limited(tmp_path, monkeypatch):
@@ -295,7 +303,7 @@ def test_without_a_word_from_the_browser_nothing_is_limited(tmp_path, monkeypatc
 def test_who_asked_for_splats_gets_splats(tmp_path):
     with shown(subject(splats=table()), tmp_path, form="splats") as page, looking(page, 1) as (browser, _):
         assert "buffer" in browser.names()["/splats"]
-        browser.wait_for(lambda b: count_in(b) == AT_REST * FIRST["splats"])
+        browser.wait_for(lambda b: count_in(b) == REST_FACTOR * INITIAL_LIMITS["splats"])
 
 
 def test_requests_that_are_wrong_are_refused_in_a_line(tmp_path):

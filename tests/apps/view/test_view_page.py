@@ -23,7 +23,7 @@ from surfkit.apps.view.page import show
 from surfkit.apps.view.plain import as_text
 from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import Shelf
+from surfkit.apps.view.shelf import SharedCache
 from surfkit.apps.view.subject import opened_subject
 from surfkit.cli import main
 from surfkit.core.check import BadInput
@@ -36,7 +36,7 @@ from surfkit.io.splats.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.partition.base import Cells, Ground
-from surfkit.partition.plan import Block, Plan
+from surfkit.partition.plan import BlockPlan, PartitionPlan
 from surfkit.runs.notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
@@ -232,7 +232,7 @@ def test_two_browsers_at_once(page, browser):
 @needs_native
 def test_the_last_browser_that_leaves_takes_what_was_chosen_for_it(page, monkeypatch):
     forgotten = []
-    monkeypatch.setattr(Shelf, "forget_choices", lambda shelf: forgotten.append(shelf))
+    monkeypatch.setattr(SharedCache, "forget_choices", lambda shelf: forgotten.append(shelf))
     first, second = (Browser(page[0].url) for _ in range(2))
     for each in (first, second):
         each.wait_for(Browser.is_whole)
@@ -247,7 +247,7 @@ def test_the_last_browser_that_leaves_takes_what_was_chosen_for_it(page, monkeyp
 def test_choices_that_are_forgotten_are_made_again(tmp_path):
     write_mesh(tmp_path / "a.ply", TRIANGLE, SURVEY)
     with opened_subject(tmp_path / "a.ply", "cpu") as subject:
-        shelf = Shelf(subject)
+        shelf = SharedCache(subject)
         kept = shelf.mesh(1)
         assert shelf.mesh(1) is kept
         shelf.forget_choices()
@@ -260,9 +260,9 @@ def test_blocks(page, tmp_path):
     east = float(np.median(subject.splats.means[:, 0]))
     boxes = ((None, None, east, None), (east, None, None, None))
     cells = Cells(Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), boxes, (0, 1))
-    blocks = (Block(0, ("a", "b"), 2, 125, 0.5), Block(1, ("b",), 1, 125, 0.5))
-    with_plan = replace(subject, plan=Plan(cells, blocks))
-    colors = Shelf(with_plan).painted(with_plan.splats, "block")
+    blocks = (BlockPlan(0, ("a", "b"), 2, 125, 0.5), BlockPlan(1, ("b",), 1, 125, 0.5))
+    with_plan = replace(subject, plan=PartitionPlan(cells, blocks))
+    colors = SharedCache(with_plan).painted(with_plan.splats, "block")
     assert len(np.unique(colors[with_plan.splats.means[:, 0] < east], axis=0)) == 1
     assert len(np.unique(colors, axis=0)) == 2
     with served(Address(), "test") as found:
@@ -310,7 +310,7 @@ def test_a_mesh_is_coloured_by_what_is_known_of_it(tmp_path, colored):
     write_mesh(tmp_path / "mesh.ply", mesh, SURVEY)
     with opened_subject(tmp_path / "mesh.ply", "cpu") as subject, served(Address(), "test") as found:
         show(subject, found, tmp_path / "out")
-        shelf = Shelf(subject)
+        shelf = SharedCache(subject)
         low, middle, high = shelf.mesh_by("views", 9)[0].colors.astype(int)
         assert low[0] > low[2] + 100 and high[2] > high[0] + 100 and abs(middle[0] - middle[2]) < 150
         small, _, large = shelf.mesh_by("error", 9)[0].colors.astype(int)
@@ -359,8 +359,8 @@ def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
     assert "/points" in names and (subject.frame.crs, subject.frame.metres) == ("EPSG:32632", 1.0)
     assert np.allclose(subject.frame.to_input(subject.points.xyz), many, atol=1e-3)
     assert subject.points.rgb[:, 0].tolist() == list(range(250)) and (subject.points.rgb[:, 1:] == [255, 0]).all()
-    monkeypatch.setattr("surfkit.apps.view.subject.MOST_POINTS", 100)
-    monkeypatch.setattr("surfkit.evaluate.geometry.las.AT_ONCE", 64)
+    monkeypatch.setattr("surfkit.apps.view.subject.MAX_CLOUD_POINTS", 100)
+    monkeypatch.setattr("surfkit.evaluate.geometry.las.CHUNK_POINTS", 64)
     places = cloud(tmp_path / "b.las", 6)
     with opened_subject(tmp_path / "b.las", "cpu") as subject:
         assert np.allclose(subject.frame.to_input(subject.points.xyz), places[::3], atol=1e-3)

@@ -60,7 +60,7 @@ def test_the_panel_of_photographs_shows_names_and_errors_as_text(monkeypatch):
         raise BadInput("<i>x</i>.jpg: damaged")
 
     monkeypatch.setattr(photographs, "picture", refused)
-    panel = photographs.Photographs.__new__(photographs.Photographs)
+    panel = photographs.PhotoComparisonTool.__new__(photographs.PhotoComparisonTool)
     panel.shelf = SimpleNamespace(subject=SimpleNamespace(scene=SimpleNamespace(train=[1]), draw=None, frame=None))
     panel.client = SimpleNamespace(scene=SimpleNamespace(remove_by_name=lambda _: None))
     panel.chosen, panel.views = 0, [SimpleNamespace(name="<b>bold</b>.jpg")]

@@ -11,7 +11,7 @@ from surfkit.compress.levels import MergedLevels
 from surfkit.compress.levels.cut import cut, depth_for
 from surfkit.compress.levels.merge import blocks
 from surfkit.compress.levels.moments import Shapes, merged_model
-from surfkit.compress.levels.pairs import Alike, groups
+from surfkit.compress.levels.pairs import MergeCost, groups
 from surfkit.core.check import BadInput
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.init import seeds
@@ -20,7 +20,7 @@ from surfkit.raster.api import ALPHA_MAX, Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import numpy_rotations
-from surfkit.scene.scene import Cloud
+from surfkit.scene.scene import SparsePoints
 from surfkit.testing.inputs import lod_input
 
 LABELS = np.array([0, 1, 0, 2, 1, 0])
@@ -28,7 +28,7 @@ LABELS = np.array([0, 1, 0, 2, 1, 0])
 
 def random_model(primitive, count=6, seed=0, opacity=0.3):
     draw = torch.Generator().manual_seed(seed)
-    cloud = Cloud(torch.rand(count, 3, generator=draw), torch.randint(0, 256, (count, 3), generator=draw).byte())
+    cloud = SparsePoints(torch.rand(count, 3, generator=draw), torch.randint(0, 256, (count, 3), generator=draw).byte())
     params = primitive.init(cloud, draw)
     params["quats"] = torch.randn(count, 4, generator=draw)
     params["scales"] = torch.randn(params["scales"].shape, generator=draw).mul(0.3).sub(3)
@@ -111,7 +111,7 @@ def plane(side=16, gap=0.1):
     turn = torch.tensor([0.9, 0.3, -0.2, 0.1])
     turns = torch.from_numpy(numpy_rotations(turn[None].double().numpy()))[0]
     xyz = at.double() @ turns[:, :2].T
-    cloud = Cloud(
+    cloud = SparsePoints(
         xyz.float(), torch.full((len(xyz), 3), 200, dtype=torch.uint8), size=torch.full((len(xyz),), 0.7 * gap)
     )
     params = primitive.init(cloud, torch.Generator().manual_seed(0)) | {"quats": turn.repeat(len(xyz), 1)}
@@ -186,7 +186,7 @@ def test_a_refined_level_is_nearer_to_the_full_model(tmp_path):
 def test_counts_halve_in_every_block_and_each_point_has_one_group():
     draw = np.random.default_rng(0)
     means, colors = draw.random((501, 3)), draw.random((501, 3))
-    labels = groups(Alike(means, draw.random(501) + 0.1, colors, draw.normal(size=(501, 3))), 251)
+    labels = groups(MergeCost(means, draw.random(501) + 0.1, colors, draw.normal(size=(501, 3))), 251)
     assert labels.shape == (501,) and set(labels) == set(range(251))
 
 
@@ -194,18 +194,18 @@ def test_alike_neighbours_are_merged_first():
     """Of four pairs side by side, the two of one colour each."""
     means = np.array([[0.0, 0, 0], [1, 0, 0], [20, 0, 0], [21, 0, 0], [40, 0, 0], [41, 0, 0], [60, 0, 0], [61, 0, 0]])
     colors = np.array([[0.0], [0], [0], [1], [1], [1], [1], [0]]).repeat(3, 1)
-    labels = groups(Alike(means, np.ones(8), colors, np.zeros((8, 3))), 6)
+    labels = groups(MergeCost(means, np.ones(8), colors, np.zeros((8, 3))), 6)
     assert labels.tolist() == [0, 0, 1, 2, 3, 3, 4, 5]
 
 
 def test_points_of_little_weight_are_merged_first():
     means = np.array([[0.0, 0, 0], [1, 0, 0], [20, 0, 0], [21, 0, 0]])
     weights = np.array([1.0, 1.0, 1.0, 1e-3])
-    assert groups(Alike(means, weights, np.zeros((4, 3)), np.zeros((4, 3))), 3).tolist() == [0, 1, 2, 2]
+    assert groups(MergeCost(means, weights, np.zeros((4, 3)), np.zeros((4, 3))), 3).tolist() == [0, 1, 2, 2]
 
 
 def test_points_in_one_place_can_be_merged():
-    labels = groups(Alike(np.zeros((40, 3)), np.ones(40), np.zeros((40, 3)), np.zeros((40, 3))), 20)
+    labels = groups(MergeCost(np.zeros((40, 3)), np.ones(40), np.zeros((40, 3)), np.zeros((40, 3))), 20)
     assert set(labels) == set(range(20))
 
 
@@ -319,7 +319,7 @@ def test_columns_of_strangers(monkeypatch):
     monkeypatch.setattr("surfkit.compress.levels.moments.name_of", lambda part: type(part).__name__.lower())
     lod = MergedLevels()
     lod.refuse_unfit(Fog())
-    places = Cloud(torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.uint8), opacity=torch.full((4,), 0.2))
+    places = SparsePoints(torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.uint8), opacity=torch.full((4,), 0.2))
     model = SplatModel(Fog(), Fog().init(places, torch.Generator().manual_seed(0)))
     merged = merged_model(model, np.array([0, 0, 1, 1]), np.array([1.0, 3, 1, 1]))
     assert merged.params["heat"].tolist() == [[1.5, 2.5], [5.0, 6.0]] and merged.params["glow"].shape == (3,)

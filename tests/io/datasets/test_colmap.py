@@ -61,7 +61,7 @@ def test_what_was_written_is_read(made):
     assert scene.name == "farm" and scene.train[0].path == folder / "images" / "view_001.png"
 
 
-@pytest.mark.parametrize("place", colmap.MODELS)
+@pytest.mark.parametrize("place", colmap.MODEL_FOLDERS)
 @pytest.mark.parametrize("binary", [False, True])
 def test_layouts_in_text_and_binary(made, tmp_path, place, binary):
     folder, truth = made
@@ -305,7 +305,7 @@ def test_no_folder(tmp_path):
     complaint("a file, not a folder; a data set is", lambda: read(Data(tmp_path / "file")))
 
 
-@pytest.mark.parametrize("part", list(colmap.PARTS))
+@pytest.mark.parametrize("part", list(colmap.MIN_ENTRY_BYTES))
 @pytest.mark.parametrize("keep", [0, 4, 20, 60, -1, -12, -30])
 def test_binary_files_that_are_cut_off(made, tmp_path, part, keep):
     """Also within the name of an image, at which pycolmap would read for ever."""

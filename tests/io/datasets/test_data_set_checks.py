@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from surfkit.core.registry import components
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.depth_files import DepthFile, write_map
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
 from surfkit.io.datasets.depth_layouts import EstimatedDepths
@@ -37,7 +37,7 @@ CALLS = []
 class WrongSplit(Split):
     case: str
 
-    def held_out(self, capture: Capture):
+    def held_out(self, capture: RawDataset):
         CALLS.append(0)
         names = [shot.name for shot in capture.shots]
         if self.case == "changes":

@@ -17,7 +17,7 @@ from surfkit.io.datasets.masks import mask_cache, read_mask, view_mask
 from surfkit.io.datasets.read import build_scene, read, read_capture, reader_of
 from surfkit.runs.notes import collect_notes
 from surfkit.scene.photos import view_photo
-from surfkit.scene.scene import Cloud, Mask, Scene
+from surfkit.scene.scene import Mask, Scene, SparsePoints
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
@@ -223,7 +223,7 @@ def test_few_masks_are_decoded_to_decide(farm, monkeypatch):
     decoded = []
     plain = masks.open_picture
     monkeypatch.setattr(masks, "open_picture", lambda path, use: decoded.append(path.name) or plain(path, use))
-    monkeypatch.setattr(masks, "THREADS", 1)
+    monkeypatch.setattr(masks, "READER_THREADS", 1)
     for number, kept in enumerate(sides()):
         put(farm / f"masks/view_00{number}.png", cut_out(kept) if number else left_black())
     found = read(Data(farm, test_every=0))
@@ -247,7 +247,7 @@ def test_an_undistorted_mask_is_made_again_when_its_alpha_channel_counts(farm):
 
 
 def scene_with(view):
-    return Scene("one", (view,), (), Cloud(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8)), None)
+    return Scene("one", (view,), (), SparsePoints(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8)), None)
 
 
 def test_a_fingerprint_knows_whether_alpha_or_colours_count(farm):

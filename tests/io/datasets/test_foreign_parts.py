@@ -14,7 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import Capture
+from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.colmap import COLMAP
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile, write_map, write_record
@@ -37,7 +37,7 @@ class Lowest(Split):
     count: int = 2
     """How many."""
 
-    def held_out(self, capture: Capture) -> list[str]:
+    def held_out(self, capture: RawDataset) -> list[str]:
         heights = {shot.name: (-shot.pose[:3, :3].T @ shot.pose[:3, 3])[2] for shot in capture.shots}
         return sorted(heights, key=heights.__getitem__)[: self.count]
 
@@ -46,7 +46,7 @@ class Lowest(Split):
 class Wrong(Split):
     """Hold out a photograph that is not there."""
 
-    def held_out(self, capture: Capture) -> set[str]:
+    def held_out(self, capture: RawDataset) -> set[str]:
         return {"nobody.png"}
 
 
@@ -83,7 +83,7 @@ class Marked(Reader):
     def recognises(self, root: Path) -> bool:
         return (root / "marked.txt").exists()
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         return replace(COLMAP().read(data), metres=7.0, numbered=False)
 
 

@@ -30,7 +30,7 @@ def joined(tracks):
 @pytest.mark.parametrize("batch", [1, 7, 20_000])
 @pytest.mark.parametrize("seed", range(6))
 def test_groups_are_those_of_sets_that_are_joined(monkeypatch, batch, seed):
-    monkeypatch.setattr(groups, "BATCH", batch)
+    monkeypatch.setattr(groups, "BATCH_TRACKS", batch)
     draw = np.random.default_rng(seed)
     tracks = [draw.integers(0, 60, draw.integers(0, 4)).tolist() for _ in range(30)]
     found = connect_groups(60, tracks)
@@ -39,7 +39,7 @@ def test_groups_are_those_of_sets_that_are_joined(monkeypatch, batch, seed):
 
 
 def test_no_more_is_read_than_connects_all(monkeypatch):
-    monkeypatch.setattr(groups, "BATCH", 10)
+    monkeypatch.setattr(groups, "BATCH_TRACKS", 10)
     chain = iter([[at, at + 1] for at in range(24)] + [[0, 0]] * 100)
     assert [group.tolist() for group in connect_groups(25, chain)] == [list(range(25))]
     assert len(list(chain)) == 94

@@ -13,11 +13,11 @@ from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.fingerprint import changed, fingerprint
 from surfkit.io.datasets.masks import mask_cache, view_mask
-from surfkit.io.datasets.panoramas import FACES
+from surfkit.io.datasets.panoramas import CUBE_FACES
 from surfkit.io.datasets.read import observations, read
 from surfkit.runs.notes import collect_notes
 from surfkit.scene.photos import view_photo
-from surfkit.scene.pixels import PLAIN
+from surfkit.scene.pixels import DEFAULT_PIXELS
 
 WIDTH, HEIGHT = 256, 128
 NAMES = ("a.png", "b.png", "c.png")
@@ -134,7 +134,7 @@ def test_the_views_of_panoramas_show_what_lies_where_they_look(tmp_path, program
         scene = read(Data(tmp_path, test_every=3))
     assert any("3 panoramas are cut into 6 views each" in text for text in kept.texts)
     assert len(scene.held_out) == 6 and len(scene.train) == 12, "the views of a panorama are held out together"
-    assert {view.name.rpartition("/")[2] for view in scene.held_out} == {f"a-{face}.png" for face in FACES}
+    assert {view.name.rpartition("/")[2] for view in scene.held_out} == {f"a-{face}.png" for face in CUBE_FACES}
     for view in (*scene.train, *scene.held_out):
         difference = view_photo(view).permute(1, 2, 0).numpy() - colour(directions(view.camera))
         assert np.abs(difference).max() < 2, view.name
@@ -197,7 +197,7 @@ def test_masks_of_panoramas_are_cut_with_them(tmp_path):
     for view in (view for view in scene.train if not view.name.startswith(NAMES[-1].partition(".")[0])):
         v, u = np.mgrid[:88, :88] + 0.5
         local = np.stack([u - 44, v - 44, np.full_like(u, WIDTH / 2 / np.pi)], -1)
-        inside = np.array(FACES[view.name.rpartition("-")[2].removesuffix(".png")], float)
+        inside = np.array(CUBE_FACES[view.name.rpartition("-")[2].removesuffix(".png")], float)
         down = (local @ inside)[..., 1] / np.linalg.norm(local, axis=-1)
         kept, clear = view_mask(view).numpy(), np.abs(down - 0.5) > 0.02
         assert (kept == (down < 0.5))[clear].all(), view.name
@@ -223,7 +223,7 @@ def test_lists_of_held_out_panoramas(tmp_path):
     colmap(tmp_path, tracks=False)
     (tmp_path / "test.txt").write_text("c.png\n")
     scene = read(Data(tmp_path, test_list=tmp_path / "test.txt"))
-    assert {view.name for view in scene.held_out} == {f"c-{face}.png" for face in FACES}
+    assert {view.name for view in scene.held_out} == {f"c-{face}.png" for face in CUBE_FACES}
 
 
 def test_a_part_of_a_panorama_is_refused(tmp_path):
@@ -273,7 +273,7 @@ def test_twelve_bits_in_panoramas_are_stretched(tmp_path):
     assert "3 photographs of 16 bits" in line and "4,095 is taken for white" in line
     for view in scene.train:
         grey = colour(directions(view.camera)) @ (0.299, 0.587, 0.114) * (0.25 if view.name[0] == "a" else 1)
-        assert np.abs(view_photo(view)[1].numpy() - grey).max() < 3 and view.pixels == PLAIN, view.name
+        assert np.abs(view_photo(view)[1].numpy() - grey).max() < 3 and view.pixels == DEFAULT_PIXELS, view.name
 
 
 def transparent_below(folder):
@@ -310,7 +310,7 @@ def test_panoramas_that_are_missing_are_skipped(tmp_path):
         read(Data(tmp_path, test_every=0))
     data = Data(tmp_path, test_every=0, missing="skip")
     scene = read(data)
-    assert [view.name for view in scene.train] == [f"{name}-{face}.png" for name in "ac" for face in FACES]
+    assert [view.name for view in scene.train] == [f"{name}-{face}.png" for name in "ac" for face in CUBE_FACES]
     assert set(observations(data, scene).seen) == {view.name for view in scene.train}
 
 
@@ -321,7 +321,7 @@ def test_a_panorama_that_has_changed_is_noticed(tmp_path):
     path = tmp_path / "images/b.png"
     Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
     found = changed(before, fingerprint(scene_of(tmp_path)[0], before))
-    assert {change.name for change in found} == {f"b-{face}.png" for face in FACES}
+    assert {change.name for change in found} == {f"b-{face}.png" for face in CUBE_FACES}
 
 
 def test_depth_maps_of_panoramas_are_told(tmp_path):

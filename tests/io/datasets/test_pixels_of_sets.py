@@ -17,9 +17,9 @@ from surfkit.io.datasets.masks import read_mask, view_mask
 from surfkit.io.datasets.pixels import decide
 from surfkit.io.datasets.read import read
 from surfkit.runs.notes import collect_notes
-from surfkit.scene.copies import Copies
+from surfkit.scene.copies import DecodedPhotoCache
 from surfkit.scene.photos import photo_cache, view_photo
-from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from tests.scene.test_pixels import geotiff, opencv
@@ -77,7 +77,7 @@ def test_exposures_stay_comparable(farm):
     for number, view in enumerate(scene.train):
         wanted = true[number] * (1.0 if number % 2 else 0.25)
         assert np.abs(view_photo(view)[0].numpy() - wanted).max() <= 1.5
-    cached = photo_cache(scene.train, 0, Copies(farm))
+    cached = photo_cache(scene.train, 0, DecodedPhotoCache(farm))
     assert torch.equal(cached[1], view_photo(scene.train[1]))
 
 
@@ -94,7 +94,9 @@ def test_a_part_of_the_photographs_is_read_as_all_are(farm):
 def test_sixteen_bits_and_eight_bits_stay_as_they_were(farm):
     rewrite(farm, lambda number, rgb: rgb[..., 1].astype(np.uint16) * (257 if number == 3 else 16))
     scene, notes = scene_of(farm)
-    assert [view.pixels for view in scene.train] == [PLAIN] * 4 and not [line for line in notes if "bits" in line]
+    assert [view.pixels for view in scene.train] == [DEFAULT_PIXELS] * 4 and not [
+        line for line in notes if "bits" in line
+    ]
 
 
 def test_a_tag_goes_before_values(tmp_path):
@@ -203,7 +205,7 @@ def test_workers_read_the_same_pixels(farm, tmp_path):
 
 
 def test_of_many_photographs_some_are_looked_at(tmp_path, monkeypatch):
-    monkeypatch.setattr(pixels, "LOOKED_AT", 3)
+    monkeypatch.setattr(pixels, "MAX_EXAMINED_PHOTOS", 3)
     for number in range(8):
         Image.fromarray(left_clear(0, np.full((4, 40, 3), 9, np.uint8))).save(tmp_path / f"{number}.png")
     (line,) = decide({path.name: path for path in sorted(tmp_path.iterdir())}).lines

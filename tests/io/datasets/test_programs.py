@@ -559,7 +559,7 @@ def test_a_bundle_file_of_photographs_of_another_size(tmp_path, by, told):
 
 
 def test_a_bundle_file_of_photographs_that_were_enlarged(tmp_path, monkeypatch):
-    monkeypatch.setattr("surfkit.io.datasets.bundler.MANY_MARKS", 20)
+    monkeypatch.setattr("surfkit.io.datasets.bundler.MIN_INNER_MARKS", 20)
     bundler(tmp_path)
     for by, count in ((1.0, 0), (2.0, 1)):
         resized(tmp_path, by)

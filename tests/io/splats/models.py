@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from surfkit.io.splats.table import COLUMNS, SplatTable
+from surfkit.io.splats.table import SPLAT_COLUMNS, SplatTable
 
 
 def table(kind="gaussian", count=700, degree=3, seed=0, **changes):
@@ -46,7 +46,7 @@ def turned(quats):
 def differences(before, after):
     """The largest difference of each column, rotations as those of matrices and opacities as those of shares."""
     after = matched(before, after)
-    found = {name: getattr(before, name).double() - getattr(after, name).double() for name in COLUMNS}
+    found = {name: getattr(before, name).double() - getattr(after, name).double() for name in SPLAT_COLUMNS}
     found["quats"] = turned(before.quats) - turned(after.quats)
     found["opacity_logits"] = before.opacity_logits.sigmoid() - after.opacity_logits.sigmoid()
     return {name: float(value.abs().max()) if value.numel() else 0.0 for name, value in found.items()}
@@ -54,4 +54,4 @@ def differences(before, after):
 
 def same(one, other):
     """Whether two tables are equal, bit by bit."""
-    return one.kind == other.kind and all(np.array_equal(getattr(one, n), getattr(other, n)) for n in COLUMNS)
+    return one.kind == other.kind and all(np.array_equal(getattr(one, n), getattr(other, n)) for n in SPLAT_COLUMNS)

@@ -10,7 +10,7 @@ import torch
 import zstandard
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.axes import NAMES, turn_between
+from surfkit.io.splats.axes import AXES_NAMES, turn_between
 from surfkit.io.splats.files import from_axes, read_splat_file
 from surfkit.io.splats.gltf import GLTF
 from surfkit.io.splats.spz import SPZ
@@ -55,14 +55,14 @@ def record(number, kind=0xADBE0003):
 
 
 def test_names_have_the_numbers_of_spz():
-    assert {name: NAMES.index(name) + 1 for name in NUMBERS} == NUMBERS and len(NAMES) == 16
+    assert {name: AXES_NAMES.index(name) + 1 for name in NUMBERS} == NUMBERS and len(AXES_NAMES) == 16
 
 
 @pytest.mark.parametrize("version", [3, 4])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", AXES_NAMES)
 def test_a_record_of_axes_is_gone_by(tmp_path, name, version):
     other = struct.pack("<II12x", 0xADBE0002, 12)
-    (tmp_path / "a.spz").write_bytes(spz_of(version, other + record(NAMES.index(name) + 1)))
+    (tmp_path / "a.spz").write_bytes(spz_of(version, other + record(AXES_NAMES.index(name) + 1)))
     with collect_notes() as notes:
         table = read_splat_file(tmp_path / "a.spz")
     np.testing.assert_allclose(table.means[0], expected([1, 2, 3], name))

@@ -21,7 +21,7 @@ from needs import needs
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.page import Page
+from surfkit.io.splats.page import HtmlPageFormat
 from surfkit.raster.api import Splats
 from surfkit.raster.reference import draw
 from surfkit.runs.notes import collect_notes
@@ -97,7 +97,7 @@ def test_the_data_are_those_of_the_splats(tmp_path, kind, degree):
     far = torch.tensor([512_345.0, 5_678_901.0, 123.0], dtype=torch.float64)
     table = splat_table(kind, 200, 3)
     table = replace(table, means=table.means.double() * 37 + far, log_scales=table.log_scales + np.log(37))
-    Page(sh_degree=degree).write(tmp_path / "a.html", table)
+    HtmlPageFormat(sh_degree=degree).write(tmp_path / "a.html", table)
     means, scales, quats, opacities, sh0, rest = decoded(tmp_path / "a.html")
     near = torch.cdist(table.means - far, torch.from_numpy(means) - far).argmin(1)
     assert sorted(near.tolist()) == list(range(200))
@@ -121,7 +121,7 @@ def test_it_loads_nothing_and_names_are_text(tmp_path):
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera(pose, 50.0, 50.0, 20.0, 15.0, 40, 30)
     view = View("</script><img src=x onerror=alert(1)>.jpg", camera, tmp_path / "none")
-    Page().write_seen(path, splat_table(count=9), Frame(np.zeros(3), 1.0), [view], None)
+    HtmlPageFormat().write_seen(path, splat_table(count=9), Frame(np.zeros(3), 1.0), [view], None)
     text = path.read_text()
     page = Elements(text)
     tags = [tag for tag, _, _ in page.found]
@@ -152,7 +152,9 @@ def test_views_are_those_of_the_cameras(tmp_path):
         )
         pose[:3, 3] = torch.tensor([0.1, -0.2, 3.0 if at else -3.0])
         views.append(View(name, Camera(pose, 80.0, 80.0, 40.0, 30.0, 80, 60), tmp_path / name))
-    Page().write_seen(tmp_path / "a.html", local.in_input_frame(frame), frame, views, np.array([0.0, 0.0, 1.0]))
+    HtmlPageFormat().write_seen(
+        tmp_path / "a.html", local.in_input_frame(frame), frame, views, np.array([0.0, 0.0, 1.0])
+    )
     facts = facts_of(tmp_path / "a.html")
     assert [view["name"] for view in facts["views"]] == ["away", "seen"] and facts["start"] == 1
     assert facts["up"] == [0, 0, 1]
@@ -177,24 +179,24 @@ def test_it_does_not_begin_at_the_rim(tmp_path):
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, 3] = torch.tensor([x, 0.0, 4.0 if x else 1.8])  # from the middle, not all are seen
         views.append(View(name, Camera(pose, 40.0, 40.0, 40.0, 20.0, 80, 40), tmp_path / name))
-    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, None)
+    HtmlPageFormat().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, None)
     facts = facts_of(tmp_path / "a.html")
     assert facts["views"][facts["start"]]["name"] == "middle"
     back = np.array([0.0, 0.0, 1.0])  # the middle looks up then
-    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
+    HtmlPageFormat().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
     assert facts_of(tmp_path / "a.html")["start"] == 1, "both look the same way"
     level = views[0].camera.world_to_camera.clone()
     level[:3, :3] = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     level[:3, 3] = torch.tensor([0.0, 0.0, 3.0])
     views = [views[1], replace(views[0], camera=replace(views[0].camera, world_to_camera=level))]
-    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
+    HtmlPageFormat().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, back)
     assert facts_of(tmp_path / "a.html")["start"] == 1, "not at the ceiling"
 
 
 def test_of_many_splats_those_are_kept_of_which_most_is_seen(tmp_path):
     table = splat_table(count=50)
     with collect_notes() as notes:
-        Page(max_splats=20).write(tmp_path / "a.html", table)
+        HtmlPageFormat(max_splats=20).write(tmp_path / "a.html", table)
     radii = np.sort(table.log_scales.exp().numpy(), axis=1)
     shown = radii[:, 1] * radii[:, 2] * table.opacity_logits.sigmoid().numpy()
     means = decoded(tmp_path / "a.html")[0]
@@ -203,14 +205,14 @@ def test_of_many_splats_those_are_kept_of_which_most_is_seen(tmp_path):
     assert "the 20 of 50 splats are kept of which most is seen; --format.max-splats keeps more" in notes.texts[0]
     assert facts_of(tmp_path / "a.html")["told"] == "20 splats of 50"
     with pytest.raises(BadInput, match="max_splats"):
-        Page(max_splats=0)
+        HtmlPageFormat(max_splats=0)
 
 
 @pytest.mark.skipif(NODE is None, reason="node is not installed")
 def test_the_script_decodes_and_sorts(tmp_path):
     """In node, as far as it needs no browser: texels word by word, and the order of the worker."""
     table = splat_table(count=300, degree=1)
-    Page().write(tmp_path / "a.html", table)
+    HtmlPageFormat().write(tmp_path / "a.html", table)
     page = Elements(tmp_path.joinpath("a.html").read_text())
     (tmp_path / "page.js").write_text(page.text("script"))
     (tmp_path / "splats.txt").write_text(page.text("script", id="splats"))
@@ -315,7 +317,7 @@ def test_the_page_draws_what_the_rasterizer_draws(tmp_path, kind, shown):
     pose[2, 3] = 3.0
     camera = Camera(pose, 90.0, 90.0, 60.0, 45.0, 120, 90)
     views = [View("a", camera, tmp_path / "a.png")]
-    Page().write_seen(tmp_path / "a.html", table, Frame(np.zeros(3), 1.0), views, None)
+    HtmlPageFormat().write_seen(tmp_path / "a.html", table, Frame(np.zeros(3), 1.0), views, None)
     sh = torch.cat([table.sh0[:, None], table.sh_rest], 1)
     splats = Splats(kind, means, table.quats, scales.exp(), table.opacity_logits.sigmoid(), sh)
     expected = draw(splats, camera, 1e-3).maps.color.clamp(0, 1).permute(1, 2, 0).double().numpy()

@@ -132,7 +132,7 @@ def test_trimesh_reads_the_same(tmp_path):
 
 
 def test_more_rows_than_a_chunk(tmp_path, monkeypatch):
-    monkeypatch.setattr(ply, "CHUNK", 3)
+    monkeypatch.setattr(ply, "WRITTEN_ROWS", 3)
     splats = table(count=10)
     write_splats(tmp_path / "a.ply", splats)
     assert torch.equal(read_splats(tmp_path / "a.ply").sh_rest, splats.sh_rest)
@@ -159,7 +159,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
     write_splats(path, table())
     before = path.read_bytes()
-    monkeypatch.setattr(ply, "CHUNK", 3)
+    monkeypatch.setattr(ply, "WRITTEN_ROWS", 3)
     rows = ply._rows
 
     def breaks(splats, part, axes):

@@ -10,7 +10,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc.emulated import Emulated, compiler
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -45,7 +45,7 @@ class Anywhere:
 
 
 @pytest.fixture(params=["emulated", "permuted", pytest.param("cuda", marks=pytest.mark.cuda)])
-def load(request) -> Callable[[Source], Kernels]:
+def load(request) -> Callable[[CudaSource], Kernels]:
     """Gives the kernels of a source, whose `device` the tensors must be on."""
     if request.param != "cuda":
         return lambda source: Emulated(source, seed=5 * (request.param == "permuted"))

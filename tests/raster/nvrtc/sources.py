@@ -8,7 +8,7 @@ from surfkit.compress.cuda import codes
 from surfkit.depth.cuda import passes
 from surfkit.mesh.cuda import grid
 from surfkit.raster.cuda import rasterizer, ssim
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.train import adam
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -18,10 +18,10 @@ class Affine(ctypes.Structure):
     _fields_ = (("scale", ctypes.c_float * 2), ("shift", ctypes.c_int))
 
 
-BASIC = Source(KERNELS / "basic.cu", structures={"Affine": Affine})
+BASIC = CudaSource(KERNELS / "basic.cu", structures={"Affine": Affine})
 
 
-def changed(source: Source, old: str, new: str, skip: int = 0) -> Source:
+def changed(source: CudaSource, old: str, new: str, skip: int = 0) -> CudaSource:
     """A source with one mistake: `new` in place of the occurrence of `old` after the first `skip`."""
     parts = source.text.split(old)
     assert len(parts) > skip + 1, f"{source.path.name} has no {old}"
@@ -30,21 +30,21 @@ def changed(source: Source, old: str, new: str, skip: int = 0) -> Source:
     return other
 
 
-def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
+def raster(name: str, kind: int = rasterizer.SURFEL) -> CudaSource:
     """Kernels of the rasterizer as most training steps use them: all maps, and a signal of the colours alone."""
     on_the_way_back = name in ("backward", "gather")
     width = {"WIDTH": rasterizer.SUMS[kind] + 4} if on_the_way_back else {}
     width |= {"COEFFICIENTS": 16} if name in ("project", "gather") else {}
-    return rasterizer.source(name, KIND=kind, LEVEL=rasterizer.DISTORTION, CHOSEN=int(on_the_way_back), **width)
+    return rasterizer.source(name, KIND=kind, LEVEL=rasterizer.LEVEL_DISTORTION, CHOSEN=int(on_the_way_back), **width)
 
 
-SHIPPED: tuple[tuple[Source, dict[str, tuple[int, ...]]], ...] = (
-    (adam.SOURCE, {"adam": (40, 0), "adam_rows": (64, 0)}),
-    (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
-    (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
-    (passes.SOURCES[16], {"improve": (128, 0, 1000)}),
-    (passes.SOURCES[32], {"improve": (168, 0, 1000)}),
-    (codes.SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
+SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
+    (adam.ADAM_SOURCE, {"adam": (40, 0), "adam_rows": (64, 0)}),
+    (ssim.SSIM_SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
+    (grid.FUSION_SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
+    (passes.SOURCE_BY_SAMPLES[16], {"improve": (128, 0, 1000)}),
+    (passes.SOURCE_BY_SAMPLES[32], {"improve": (168, 0, 1000)}),
+    (codes.CODES_SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
     (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),

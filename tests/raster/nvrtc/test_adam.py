@@ -5,12 +5,12 @@ import torch
 
 from surfkit.primitives.points import Points
 from surfkit.train import adam
-from surfkit.train.adam import SOURCE, adam_step, launch_update, launch_update_rows, update, update_rows
+from surfkit.train.adam import ADAM_SOURCE, adam_step, launch_update, launch_update_rows, update, update_rows
 
 
 @pytest.mark.parametrize("shape", [(1,), (1023, 1), (1024,), (1025,), (700, 3), (65, 16, 3), (0, 3)])
 def test_agrees_with_the_cpu(load, shape):
-    on = load(SOURCE)
+    on = load(ADAM_SOURCE)
     draw = torch.Generator().manual_seed(len(shape))
     value = torch.randn(shape, generator=draw)
     theirs = [value.clone(), torch.zeros(shape), torch.zeros(shape)]
@@ -27,7 +27,7 @@ def test_agrees_with_the_cpu(load, shape):
 
 @pytest.mark.parametrize("shape", [(1,), (1500,), (700, 3), (131, 15, 3)])
 def test_some_rows_agree_with_the_cpu(load, shape):
-    on = load(SOURCE)
+    on = load(ADAM_SOURCE)
     draw = torch.Generator().manual_seed(len(shape))
     theirs = [torch.randn(shape, generator=draw), torch.zeros(shape), torch.zeros(shape)]
     ours = [tensor.clone().to(on.device) for tensor in theirs]

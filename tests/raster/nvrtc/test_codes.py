@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from surfkit.compress.cuda import codes as module
-from surfkit.compress.cuda.codes import SOURCE, GpuSearch, sums
+from surfkit.compress.cuda.codes import CODES_SOURCE, GpuSearch, sums
 from surfkit.compress.kmeans import kmeans, nearest
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
@@ -44,7 +44,7 @@ def test_nearest_is_that_of_brute_force(load, shape):
     """One vector, fewer codes than a tile, and just more."""
     count, codes, dimensions = shape
     vectors, codebook = drawn(count, dimensions), drawn(codes, dimensions, 1)
-    found = search(load(SOURCE), vectors, codebook)
+    found = search(load(CODES_SOURCE), vectors, codebook)
     assert_nearest(found, brute(vectors, codebook))
     assert all(torch.equal(a, b) for a, b in zip(found, nearest(vectors, codebook), strict=True)), "bits of the CPU"
 
@@ -58,7 +58,7 @@ def test_equal_distances_go_to_the_lowest_index(load):
     vectors, codebook = whole(150, 0), whole(700, 1)
     true = brute(vectors, codebook)
     assert ((true == true.min(1, keepdims=True)).sum(1) > 1).mean() > 0.4
-    index, distance = search(load(SOURCE), vectors, codebook)
+    index, distance = search(load(CODES_SOURCE), vectors, codebook)
     assert (index.numpy() == true.argmin(1)).all() and (distance.numpy() == true.min(1)).all()
 
 
@@ -72,7 +72,7 @@ def test_rounding_errors_rule_no_nearest_code_out(load, change):
         vectors = codebook[:1] + drawn(60, 45)
     else:
         vectors, codebook = vectors * change, codebook * change
-    index, _ = search(load(SOURCE), vectors, codebook)
+    index, _ = search(load(CODES_SOURCE), vectors, codebook)
     true = brute(vectors, codebook)
     found = np.take_along_axis(true, index.numpy()[:, None].astype(int), 1)[:, 0]
     assert (found <= true.min(1) * (1 + 1e-13)).all()
@@ -80,7 +80,7 @@ def test_rounding_errors_rule_no_nearest_code_out(load, change):
 
 
 def test_a_code_may_be_left_out(load):
-    on, codebook = load(SOURCE), drawn(90, 7)
+    on, codebook = load(CODES_SOURCE), drawn(90, 7)
     own = torch.arange(90, dtype=torch.int32)
     assert_nearest(search(on, codebook, codebook, own), brute(codebook, codebook) + np.diag(np.full(90, np.inf)))
     index, distance = search(on, codebook[:1], codebook[:1], own[:1])
@@ -99,7 +99,7 @@ def summed(vectors, weights, index, codes):
 @pytest.mark.parametrize("shape", [(0, 3, 2), (1, 1, 1), (400, 30, 45), (90, 200, 64), (50, 2, 130)], ids=str)
 def test_sums_have_the_bits_of_their_order(load, shape):
     count, codes, dimensions = shape
-    on, vectors = load(SOURCE), drawn(count, dimensions)
+    on, vectors = load(CODES_SOURCE), drawn(count, dimensions)
     weights = torch.rand(count, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     index = torch.from_numpy(np.random.default_rng(0).integers(0, codes, count).astype(np.int32))
     found = sums(*(each.to(on.device) for each in (vectors, weights, index)), codes, on)
@@ -108,7 +108,7 @@ def test_sums_have_the_bits_of_their_order(load, shape):
 
 def test_kmeans_has_the_bits_of_the_cpu(monkeypatch):
     """On a simulated GPU, in parts; an iteration waits six times."""
-    monkeypatch.setattr(module, "ROWS", 256)
+    monkeypatch.setattr(module, "VECTORS_PER_LAUNCH", 256)
     vectors, weights = drawn(600, 9), torch.rand(600, generator=torch.Generator().manual_seed(0))
     true = kmeans(vectors, 40, weights, iterations=3)
     with simulated_gpu() as gpu:
@@ -164,7 +164,7 @@ def clustering(source):
 @pytest.mark.parametrize("name", [None, *MISTAKES])
 def test_mistakes(name):
     if name is None:
-        return clustering(SOURCE)
+        return clustering(CODES_SOURCE)
     old, new, skip, message = MISTAKES[name]
     with pytest.raises(KernelError, match=message):
-        clustering(changed(SOURCE, old, new, skip=skip))
+        clustering(changed(CODES_SOURCE, old, new, skip=skip))

@@ -12,7 +12,7 @@ from surfkit.raster.nvrtc.arguments import BufferArgument
 from surfkit.raster.nvrtc.driver import Driver
 from surfkit.raster.nvrtc.modules import Compiled, Emulated, kernels
 from surfkit.raster.nvrtc.nvrtc import Nvrtc, image, nvrtc, resources
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 from .sources import BASIC, KERNELS, SHIPPED, Affine
 
@@ -73,7 +73,7 @@ def test_images_are_kept(compiler, tmp_path, monkeypatch):
     made = []
     compile = Nvrtc.compile
     monkeypatch.setattr(Nvrtc, "compile", lambda *a: made.append(a[2]) or compile(*a))
-    other = Source(KERNELS / "basic.cu", defines={"UNUSED": 1})
+    other = CudaSource(KERNELS / "basic.cu", defines={"UNUSED": 1})
     first = image(BASIC, "sm_80")
     assert first[:4] == b"\x7fELF" and image(BASIC, "sm_80", 13000) == first and made == ["sm_80"]
     image(other, "sm_80")
@@ -96,7 +96,7 @@ def test_mistakes_of_sources_are_shown(compiler, tmp_path):
     (tmp_path / "part.h").write_text("inline int f() { return unknown_name; }\n")
     (tmp_path / "bad.cu").write_text('#include "part.h"\nKERNEL(32) k(Buffer<int> x) { x[0] = f(); }\n')
     with pytest.raises(RuntimeError, match=r'(?s)bad.cu does not compile for sm_80.*part.h\(1\).*"unknown_name"'):
-        compiler.compile(Source(tmp_path / "bad.cu"), "sm_80")
+        compiler.compile(CudaSource(tmp_path / "bad.cu"), "sm_80")
 
 
 def test_resources_are_read(compiler):
@@ -116,7 +116,7 @@ def test_spills_are_seen(compiler, tmp_path):
             for (int i = 0; i < 64; i++) x[i * 1024 + threadIdx.x] = v[63 - i] * v[i];
         }"""
     )
-    _, log = compiler.compile(Source(tmp_path / "many.cu"), "sm_80")
+    _, log = compiler.compile(CudaSource(tmp_path / "many.cu"), "sm_80")
     assert resources(log)["many"]["registers"] <= 32 and resources(log)["many"]["spills"] > 0
 
 

@@ -10,7 +10,7 @@ from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc import emulated
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.raster.nvrtc.modules import kernels
-from surfkit.raster.nvrtc.source import Source
+from surfkit.raster.nvrtc.source import CudaSource
 
 from .conftest import Anywhere
 from .sources import BASIC, KERNELS, Affine
@@ -146,7 +146,7 @@ THREADS |= dict.fromkeys(("shuffle_of_others", "foreign_mask", "different_calls"
 
 @pytest.fixture(scope="module")
 def wrong():
-    return Source(KERNELS / "wrong.cu")
+    return CudaSource(KERNELS / "wrong.cu")
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -221,7 +221,7 @@ def test_structures_of_another_size_are_refused():
         _fields_ = (("scale", ctypes.c_float * 2),)
 
     with pytest.raises(TypeError, match="kernel apply, a: Affine has 12 bytes, Short 8"):
-        Emulated(Source(KERNELS / "basic.cu", structures={"Affine": Short}))
+        Emulated(CudaSource(KERNELS / "basic.cu", structures={"Affine": Short}))
 
 
 def test_no_compiler(monkeypatch):
@@ -241,7 +241,7 @@ def test_compiled_once(tmp_path, monkeypatch):
     for number, files in ((1, 1), (1, 1), (2, 2)):
         out = torch.zeros(32, dtype=torch.int32)
         emulated._library.cache_clear()
-        Emulated(Source(source, defines={"NUMBER": number})).launch("one", 1, 32, out)
+        Emulated(CudaSource(source, defines={"NUMBER": number})).launch("one", 1, 32, out)
         assert out.unique().tolist() == [number]
         assert len(list((tmp_path / "cuda").iterdir())) == files
 
@@ -253,6 +253,8 @@ def test_all_libraries_share_one_set_of_stacks(tmp_path):
     source.write_text("KERNEL(256) wide(Buffer<int> out) { out[threadIdx.x] = NUMBER; }\n")
     guards = []
     for number in range(3):
-        Emulated(Source(source, defines={"NUMBER": number})).launch("wide", 1, 256, torch.zeros(256, dtype=torch.int32))
+        Emulated(CudaSource(source, defines={"NUMBER": number})).launch(
+            "wide", 1, 256, torch.zeros(256, dtype=torch.int32)
+        )
         guards.append(sum(" ---p " in line for line in Path("/proc/self/maps").read_text().splitlines()))
     assert 256 <= guards[0] and guards[-1] < guards[0] + 20  # a library has a few of its own

@@ -9,8 +9,8 @@ from mesh.shapes import around, look_at, seen, slope, sphere
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.cuda import grid as module
-from surfkit.mesh.cuda.grid import SOURCE, GpuGrid, most_blocks, view_of
-from surfkit.mesh.lattice import BLOCK_BYTES, FADE, FULL, SIDE, Lattice, Picture
+from surfkit.mesh.cuda.grid import FUSION_SOURCE, GpuGrid, most_blocks, view_of
+from surfkit.mesh.lattice import BLOCK_BYTES, BLOCK_SIDE_VOXELS, FADE_START_VOXELS, FULL_WEIGHT, FusionImage, Lattice
 from surfkit.mesh.reference import ReferenceGrid, unpack
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.raster.nvrtc.nvrtc import nvrtc
@@ -30,7 +30,7 @@ def pictures(cameras, shape, seed=0):
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
         slant = draw.uniform(0.3, 1.3, depth.shape).astype(np.float32)
-        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
+        yield FusionImage(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 
 def contents(grid):
@@ -61,7 +61,7 @@ def fused(on, views, carve=False, lattice=LATTICE):
 def test_bits_of_the_cpu(load, shape, carve):
     views = list(pictures([*around(3, above=shape is slope), INSIDE], shape))
     views[0].depth[10:20, 30:40] = 0
-    found, true = fused(load(SOURCE), views, carve)
+    found, true = fused(load(FUSION_SOURCE), views, carve)
     assert_same(found, true)
     assert found.blocks > 20 and contents(found)[2].max() > 32
     surfaces = [vars(grid.surface(8, (0, 5, 5), True)).values() for grid in (found, true)]
@@ -70,7 +70,7 @@ def test_bits_of_the_cpu(load, shape, carve):
 
 
 def test_the_surface_without_a_compiler(load, monkeypatch):
-    found, true = fused(load(SOURCE), pictures(around(2), sphere))
+    found, true = fused(load(FUSION_SOURCE), pictures(around(2), sphere))
     monkeypatch.setattr(module, "grid", ReferenceGrid)
     for a, b in zip(*(vars(grid.surface(8)).values() for grid in (found, true)), strict=True):
         assert np.array_equal(a, b)
@@ -78,34 +78,34 @@ def test_the_surface_without_a_compiler(load, monkeypatch):
 
 @pytest.mark.parametrize("carve", [False, True])
 def test_chunks_change_nothing(load, carve, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 7)
-    found, true = fused(load(SOURCE), pictures([*around(3), INSIDE], sphere), carve)
+    monkeypatch.setattr(module, "CHUNK_BLOCKS", 7)
+    found, true = fused(load(FUSION_SOURCE), pictures([*around(3), INSIDE], sphere), carve)
     assert len(found.chunks) == -(-found.blocks // 7) > 5 and found.bytes == len(found.chunks) * 7 * BLOCK_BYTES
     assert_same(found, true)
     assert np.array_equal(found.surface(8).vertices, true.surface(8).vertices)
 
 
-def flat(depth, size=(60, 80), weight=FULL, focal=100.0):
+def flat(depth, size=(60, 80), weight=FULL_WEIGHT, focal=100.0):
     """A picture of one depth, by a camera at the origin."""
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera(pose, focal, focal, size[1] / 2, size[0] / 2, size[1], size[0])
-    return Picture(np.full(size, depth, np.float32), np.full(size, weight << 24 | 0x336699, np.uint32), camera)
+    return FusionImage(np.full(size, depth, np.float32), np.full(size, weight << 24 | 0x336699, np.uint32), camera)
 
 
 def test_distances_and_weights_of_a_wall(load):
     """In float64: the distance of each voxel to a wall, and a weight that falls behind it."""
-    on, depth = load(SOURCE), 2.013
+    on, depth = load(FUSION_SOURCE), 2.013
     grid = GpuGrid(LATTICE, on.device, on)
     grid.fuse(flat(depth), carve=False)
     keys, distance, weight, color = contents(grid)
-    z, y, x = np.indices((SIDE,) * 3).reshape(3, -1)
-    at = (unpack(keys)[:, :, None] * SIDE + np.stack([x, y, z])) * VOXEL
+    z, y, x = np.indices((BLOCK_SIDE_VOXELS,) * 3).reshape(3, -1)
+    at = (unpack(keys)[:, :, None] * BLOCK_SIDE_VOXELS + np.stack([x, y, z])) * VOXEL
     u, v = (100 * at[:, axis] / at[:, 2] + middle for axis, middle in ((0, 40), (1, 30)))
     inside = (u > 0.01) & (u < 79.99) & (v > 0.01) & (v < 59.99)
     sdf = depth - at[:, 2]
     cut = LATTICE.truncation
     true = np.minimum(sdf / cut, 1)
-    fall = np.where(sdf < -FADE * VOXEL, (cut + sdf) / (cut - FADE * VOXEL), 1) * FULL
+    fall = np.where(sdf < -FADE_START_VOXELS * VOXEL, (cut + sdf) / (cut - FADE_START_VOXELS * VOXEL), 1) * FULL_WEIGHT
     clear = inside & (abs(fall % 1 - 0.5) > 1e-3) & (sdf > -cut + 1e-3)
     assert clear.sum() > 5000 and np.array_equal(weight[clear], np.floor(fall + 0.5)[clear])
     seen = clear & (fall > 1)
@@ -132,19 +132,21 @@ STRANGE = {
 @pytest.mark.parametrize("name", STRANGE)
 def test_strange_pictures(load, name, carve):
     with np.errstate(invalid="ignore"):
-        found, true = fused(load(SOURCE), STRANGE[name](), carve)
+        found, true = fused(load(FUSION_SOURCE), STRANGE[name](), carve)
     assert_same(found, true)
     assert (found.blocks > 0) == (name not in ("nothing seen", "depth behind the camera", "no weight"))
 
 
 def test_borders_of_a_tile(load):
-    found, true = fused(load(SOURCE), pictures(around(3), sphere), lattice=Lattice(VOXEL, 0.12, (-1, -9, 0), (2, 0, 1)))
+    found, true = fused(
+        load(FUSION_SOURCE), pictures(around(3), sphere), lattice=Lattice(VOXEL, 0.12, (-1, -9, 0), (2, 0, 1))
+    )
     assert 0 < found.blocks < 20 and {*unpack(found.sorted.cpu().numpy())[:, 2]} == {0}
     assert_same(found, true)
 
 
 def test_no_block_beyond_the_limit(load):
-    on, (first, second) = load(SOURCE), pictures(around(2), sphere)
+    on, (first, second) = load(FUSION_SOURCE), pictures(around(2), sphere)
     one = GpuGrid(LATTICE, on.device, on)
     assert one.fuse(first, False)
     before = contents(one)
@@ -155,7 +157,7 @@ def test_no_block_beyond_the_limit(load):
 
 def test_a_gpu_without_memory(monkeypatch):
     """What does not fit is left to smaller tiles; where nothing fits, a line says what to do."""
-    on, (first, second), zeros = Emulated(SOURCE), pictures(around(2), sphere), torch.zeros
+    on, (first, second), zeros = Emulated(FUSION_SOURCE), pictures(around(2), sphere), torch.zeros
     made = []
 
     def full(*size, **how):
@@ -169,7 +171,7 @@ def test_a_gpu_without_memory(monkeypatch):
     ReferenceGrid(LATTICE).fuse(first, False)
     blocks = fused(on, [first])[1].blocks
     made.clear()
-    monkeypatch.setattr(module, "CHUNK", blocks)
+    monkeypatch.setattr(module, "CHUNK_BLOCKS", blocks)
     assert grid.fuse(first, False) and not grid.fuse(second, False) and grid.blocks == blocks
     allowed = 0
     made.clear()
@@ -214,12 +216,12 @@ def volume(source):
 
 @pytest.mark.parametrize("name", [None, *MISTAKES])
 def test_mistakes(name, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 40)
+    monkeypatch.setattr(module, "CHUNK_BLOCKS", 40)
     if name is None:
-        return volume(SOURCE)
+        return volume(FUSION_SOURCE)
     old, new, skip, message = MISTAKES[name]
     with pytest.raises(KernelError, match=message):
-        volume(changed(SOURCE, old, new, skip=skip))
+        volume(changed(FUSION_SOURCE, old, new, skip=skip))
 
 
 def test_no_product_and_sum_in_one_rounding():
@@ -228,12 +230,14 @@ def test_no_product_and_sum_in_one_rounding():
         compiler = nvrtc()
     except BadInput as error:
         pytest.skip(str(error))
-    exact, joined = (compiler.compile(source, "compute_90")[0] for source in (SOURCE, replace(SOURCE, is_exact=False)))
+    exact, joined = (
+        compiler.compile(source, "compute_90")[0] for source in (FUSION_SOURCE, replace(FUSION_SOURCE, is_exact=False))
+    )
     assert b"fma.rn" in joined and b"fma.rn" not in exact and b"mul.rn" in exact
 
 
 def test_the_view_of_a_camera():
     """The centre of the camera, in blocks."""
     camera = around(3)[1]
-    eye = np.array(view_of(LATTICE, camera).eye) * VOXEL * SIDE
+    eye = np.array(view_of(LATTICE, camera).eye) * VOXEL * BLOCK_SIDE_VOXELS
     np.testing.assert_allclose(eye, camera.centre.numpy(), rtol=1e-12)

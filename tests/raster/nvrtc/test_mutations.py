@@ -46,18 +46,18 @@ def similarity(source) -> None:
 
 
 def test_right_as_it_is():
-    similarity(ssim.SOURCE)
+    similarity(ssim.SSIM_SOURCE)
 
 
 @pytest.mark.parametrize("name", SSIM)
 def test_mistakes_in_similarity(name):
     old, new, skip, message = SSIM[name]
     with pytest.raises(KernelError, match=message):
-        similarity(changed(ssim.SOURCE, old, new, skip=skip))
+        similarity(changed(ssim.SSIM_SOURCE, old, new, skip=skip))
 
 
 def test_mistakes_in_adam():
-    source = changed(adam.SOURCE, "i >= value.size", "i > value.size")
+    source = changed(adam.ADAM_SOURCE, "i >= value.size", "i > value.size")
     tensors = [torch.rand(100) for _ in range(4)]
     with pytest.raises(KernelError, match="index 100 of gradient, which has 100 elements"):
         adam.launch_update(Emulated(source), *tensors, 0.1, 1)

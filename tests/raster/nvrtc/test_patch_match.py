@@ -7,18 +7,18 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit.depth.cuda.passes import SOURCES, GpuPasses
-from surfkit.depth.native import Grey, Planes, Terms, improve
+from surfkit.depth.cuda.passes import SOURCE_BY_SAMPLES, GpuPasses
+from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.scene.camera import Camera
 
 from .sources import changed
 
 pytestmark = needs_native
-TERMS = Terms(0.2, 2, 14, 0.5, 0.015, 0.2, 15, 2.5, samples=32, best=2, window=7, survey=False)
+TERMS = MatchingSettings(0.2, 2, 14, 0.5, 0.015, 0.2, 15, 2.5, samples=32, best=2, window=7, survey=False)
 
 
-def pictures(count: int, seed: int = 0) -> list[Grey]:
+def pictures(count: int, seed: int = 0) -> list[GreyImage]:
     """Of one textured plane with a step in it, by cameras beside each other, of several sizes."""
     draw = np.random.default_rng(seed)
     texture = draw.normal(128, 40, (40, 52)).repeat(3, 0).repeat(3, 1)
@@ -32,11 +32,11 @@ def pictures(count: int, seed: int = 0) -> list[Grey]:
         shown = texture[(y + 10 - round(4 * (at % 2))) % 120, (x + 10 + np.rint(shift).astype(int)) % 156]
         shown = shown + draw.normal(0, 2, shown.shape)
         camera = Camera(pose, 40.0, 41.0, 22.0, 15.0, width, height)
-        found.append(Grey(camera, shown.clip(0, 255).astype(np.uint8)))
+        found.append(GreyImage(camera, shown.clip(0, 255).astype(np.uint8)))
     return found
 
 
-def begun(grey: Grey, views: int, seed: int = 1) -> Planes:
+def begun(grey: GreyImage, views: int, seed: int = 1) -> Planes:
     """Slanted planes and costs by view, drawn."""
     draw = np.random.default_rng(seed)
     planes = Planes.at(draw.uniform(0.3, 1.5, grey.value.shape).astype(np.float32), views)
@@ -50,7 +50,7 @@ def copied(planes: Planes) -> Planes:
     return Planes(planes.value.copy(), planes.cost.copy(), planes.each.copy())
 
 
-def known(seen: list[Grey], seed: int = 2) -> list[torch.Tensor | None]:
+def known(seen: list[GreyImage], seed: int = 2) -> list[torch.Tensor | None]:
     """Maps of half the size; one is missing, and one has holes."""
     draw = np.random.default_rng(seed)
     maps = [
@@ -93,7 +93,7 @@ def test_planes_of_the_cpu(load, name):
     true = begun(here, len(others))
     found, before = copied(true), copied(true)
     improve(here, others, true, terms, seed=3, known=maps)
-    passes = GpuPasses(load(SOURCES[16]).device, load)
+    passes = GpuPasses(load(SOURCE_BY_SAMPLES[16]).device, load)
     passes.improve(here, others, found, terms, seed=3, known=maps)
     assert differing(found, true) < 0.01
     assert differing(before, true) > 0.8
@@ -104,7 +104,7 @@ def test_several_passes_find_what_those_of_the_cpu_find(load):
     here, *others = pictures(4)
     true = begun(here, len(others))
     found = copied(true)
-    passes = GpuPasses(load(SOURCES[16]).device, load)
+    passes = GpuPasses(load(SOURCE_BY_SAMPLES[16]).device, load)
     for index in range(4):
         terms = replace(TERMS, samples=32 if index == 3 else 16, survey=index == 0, consistency=0.0)
         improve(here, others, true, terms, seed=index)
@@ -132,12 +132,12 @@ def test_the_same_bits_twice_in_any_order():
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1), (3, 3), (1, 1)])
 def test_pictures_of_a_few_pixels(load, shape):
     camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
-    grey = Grey(camera, np.full(shape, 128, np.uint8))  # and without texture
+    grey = GreyImage(camera, np.full(shape, 128, np.uint8))  # and without texture
     true = Planes.at(np.full(shape, 0.5, np.float32), 2)
     found = copied(true)
     terms = replace(TERMS, survey=True, samples=16)
     improve(grey, [grey, grey], true, terms, seed=1)
-    GpuPasses(load(SOURCES[16]).device, load).improve(grey, [grey, grey], found, terms, seed=1)
+    GpuPasses(load(SOURCE_BY_SAMPLES[16]).device, load).improve(grey, [grey, grey], found, terms, seed=1)
     assert differing(found, true) == 0
 
 
@@ -172,7 +172,7 @@ def test_mistakes_are_seen(name):
     true = begun(here, len(others))
     found, maps, terms = copied(true), known(others), replace(TERMS, samples=16)
     improve(here, others, true, terms, seed=3, known=maps)
-    wrong = Emulated(changed(SOURCES[16], *MISTAKES[name]))
+    wrong = Emulated(changed(SOURCE_BY_SAMPLES[16], *MISTAKES[name]))
     with pytest.raises(KernelError, match=r"index -\d+ of here|other planes"):
         GpuPasses(torch.device("cpu"), lambda source: wrong).improve(here, others, found, terms, seed=3, known=maps)
         if differing(found, true) > 0.012:

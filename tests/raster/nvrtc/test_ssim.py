@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from surfkit.raster.cuda.ssim import SOURCE, backward, forward
+from surfkit.raster.cuda.ssim import SSIM_SOURCE, backward, forward
 from surfkit.raster.nvrtc.modules import Kernels
 from surfkit.raster.ssim import ssim_reference
 
@@ -33,7 +33,7 @@ def launched(on: Kernels, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("size", SIZES)
 def test_agrees_with_plain_torch(load, size, kind):
     x, y = photographs(size, kind)
-    on = load(SOURCE)
+    on = load(SSIM_SOURCE)
     value, gradient = launched(on, x, y)
     exact = x.double().requires_grad_()
     expected = ssim_reference(exact, y.double())

@@ -16,7 +16,7 @@ import torch
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
-from surfkit.densify import Limited
+from surfkit.densify import PointCap
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Step
 from surfkit.io.datasets.data import Data
@@ -28,7 +28,7 @@ from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 from surfkit.runs.blocks import forecast, schedule, worker
-from surfkit.runs.blocks.block import Block, read_plan
+from surfkit.runs.blocks.block import BlockRun, read_plan
 from surfkit.runs.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, apply_fallback, next_fallback
 from surfkit.runs.blocks.schedule import Compute, Unfinished
 from surfkit.runs.execute import Pool, base
@@ -230,7 +230,7 @@ def test_the_kind_of_a_failure_is_what_the_executor_reports(undisturbed, kind):
     loaded = opened(undisturbed)
     plan = read_plan(loaded).plan
     for why, status in (("an OutOfMemoryError, or OUT_OF_MEMORY", 70), (None, -9)):
-        block = Block(replace(loaded, out=loaded.out / "elsewhere"), plan, 0)
+        block = BlockRun(replace(loaded, out=loaded.out / "elsewhere"), plan, 0)
         told = schedule.record_failure(block, JobResult(Job(0, block.folder, lambda: 0, ()), status, why, kind))
         assert told.startswith(f"failed: {why}" if why else "was ended by SIGKILL")
         assert read_state(block.folder).kind == block.state.kind == (kind or "crash")
@@ -239,8 +239,8 @@ def test_the_kind_of_a_failure_is_what_the_executor_reports(undisturbed, kind):
 
 
 def test_the_system_counts_whom_it_ends(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "GROUPS", tmp_path)
-    monkeypatch.setattr(memory, "OWN", tmp_path / "own")
+    monkeypatch.setattr(memory, "CGROUP_ROOT", tmp_path)
+    monkeypatch.setattr(memory, "PROCESS_CGROUP", tmp_path / "own")
     monkeypatch.setattr(memory, "VMSTAT", tmp_path / "vmstat")
     assert memory.oom_kills() == 0
     (tmp_path / "vmstat").write_text("nr_free_pages 7\noom_kill 4\n")
@@ -276,9 +276,9 @@ class Splitting(Densify):
 def test_after_memory_ran_out_any_densifier_goes_on_with_a_limit(undisturbed, data, recipe, tmp_path):
     """Not one that has a setting for it alone: it is neither left as it is nor left out."""
     loaded = opened(undisturbed)
-    for densify, wanted in ((Splitting(), Limited(Splitting(), 300)), (GROWING, GROWING.limited(300)), (None, None)):
+    for densify, wanted in ((Splitting(), PointCap(Splitting(), 300)), (GROWING, GROWING.limited(300)), (None, None)):
         changed = replace(loaded.recipe, tune=replace(loaded.recipe.tune, densify=densify))
-        block = Block(replace(loaded, out=tmp_path, recipe=changed), read_plan(loaded).plan, 0)
+        block = BlockRun(replace(loaded, out=tmp_path, recipe=changed), read_plan(loaded).plan, 0)
         assert apply_fallback(block, CacheSettings())[0] == block.stage
         block.write(fallback=NO_GROWTH, most_points=300)
         stage, caches = apply_fallback(block, CacheSettings())

@@ -18,7 +18,7 @@ from surfkit.core.codec import read_json
 from surfkit.raster.select import select
 from surfkit.runs import pipeline
 from surfkit.runs.blocks import forecast, schedule, worker
-from surfkit.runs.blocks.block import Block
+from surfkit.runs.blocks.block import BlockRun
 from surfkit.runs.blocks.schedule import Compute, Unfinished
 from surfkit.runs.execute import Inline, Pool
 from surfkit.runs.execute.state import read_state
@@ -46,7 +46,7 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
 
 def test_merged_points_lie_in_their_block(undisturbed):
     """ViewCounts from the blocks' own results: what each owns of what it has come to, in their order."""
-    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.BlocksRecord).plan
     parts = []
     for index in range(2):
         state, _ = checkpoint.load_last(undisturbed / "blocks" / f"{index:03}" / "tune" / "checkpoint.safetensors")
@@ -143,7 +143,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
 def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
     """By a worker that does not see our disk, say; nothing of its work is here."""
     command = schedule.job_of
-    monkeypatch.setattr(schedule, "ARRIVE_S", 0.2)
+    monkeypatch.setattr(schedule, "FILE_ARRIVAL_S", 0.2)
     monkeypatch.setattr(schedule, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
     with pytest.raises(Unfinished, match="block 1 failed: nothing of its work has come to"):
         run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
@@ -179,10 +179,12 @@ def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
     run(longer, data, tmp_path, Compute("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
-    before = read_json(tmp_path / "blocks-before" / "plan.json", schedule.Record)
+    before = read_json(tmp_path / "blocks-before" / "plan.json", schedule.BlocksRecord)
     (tmp_path / "blocks" / "plan.json").unlink()
     run(longer, data, tmp_path, Compute("cpu"), EVERY)
-    assert read_json(tmp_path / "blocks-before" / "plan.json", schedule.Record) == before, "nothing is overwritten"
+    assert read_json(tmp_path / "blocks-before" / "plan.json", schedule.BlocksRecord) == before, (
+        "nothing is overwritten"
+    )
     assert (tmp_path / "blocks-before-2" / "000").is_dir() and "blocks-before-2" in (tmp_path / "run.json").read_text()
 
 
@@ -242,7 +244,7 @@ def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
     other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"held\n"
-        assert main(["tune", str(tmp_path / "run"), "0"]) == worker.BUSY
+        assert main(["tune", str(tmp_path / "run"), "0"]) == worker.BUSY_STATUS
     finally:
         other.kill()
         other.wait()
@@ -286,9 +288,9 @@ def test_tune_by_hand(undisturbed, tmp_path, capsys):
 
 def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, monkeypatch):
     """From pieces of 7 points, against the whole coarse model and pictures of all of it."""
-    monkeypatch.setattr(streaming, "ROWS", 7)
+    monkeypatch.setattr(streaming, "PIECE_POINTS", 7)
     loaded, _, scene = load_run(undisturbed)
-    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.BlocksRecord).plan
     rasterizer = select("cpu")[0]
     ctx = worker.RunContext(loaded, scene, rasterizer, EVERY, CacheSettings())
     coarse = checkpoint.load(undisturbed / "pretrain" / "checkpoint.safetensors")
@@ -297,7 +299,7 @@ def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, m
         views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
         wanted = plan.cells.owner(coarse.points.params["means"]) == index
         wanted |= rasterizer.render(splats, views[0].camera, loaded.recipe.pretrain.near).seen
-        begun = worker.Start(ctx, Block(loaded, plan, index), views)()
+        begun = worker.BlockStart(ctx, BlockRun(loaded, plan, index), views)()
         found = begun.params
         assert begun.sh_degree == coarse.sh_degree == 3
         assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
@@ -335,14 +337,14 @@ def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_pa
 def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_path):
     """Not what it owns: what its views show is drawn, too. Its few views are all looked at here, so it is exact."""
     loaded, _, scene = load_run(undisturbed)
-    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.BlocksRecord).plan
     begun = read_state(undisturbed / "blocks" / "000").begun_points
     assert plan.blocks[0].begins == begun > plan.blocks[0].points
     fresh = worker.RunContext(replace(loaded, out=tmp_path), scene, select("cpu")[0], EVERY, CacheSettings())
-    memory = [schedule.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes]
-    Block(fresh.run, plan, 0).write(begun_points=begun + 10)
-    memory.append(schedule.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes)
-    assert memory[1] - memory[0] == 10 * 3 * forecast.POINT_BYTES, "what it has really begun with counts more"
+    memory = [schedule.job_of(fresh, BlockRun(fresh.run, plan, 0), Compute("cpu")).memory_bytes]
+    BlockRun(fresh.run, plan, 0).write(begun_points=begun + 10)
+    memory.append(schedule.job_of(fresh, BlockRun(fresh.run, plan, 0), Compute("cpu")).memory_bytes)
+    assert memory[1] - memory[0] == 10 * 3 * forecast.TRAINED_POINT_BYTES, "what it has really begun with counts more"
 
 
 def test_an_inline_executor_is_the_default(recipe):

@@ -18,7 +18,7 @@ from surfkit.runs.blocks.eta import (
     total_seconds_left,
 )
 from surfkit.runs.execute.state import BlockState, read_state, write_state
-from surfkit.runs.status import KNOWN, Block, Status
+from surfkit.runs.status import SHOWN_FIELDS, BlockStatus, Status
 from surfkit.train import progress
 
 RUNNING = BlockState("running", step=130, steps=300, first=30, began=1000.0, heard=1020.0)
@@ -43,8 +43,8 @@ def test_time_left_of_a_block():
 def test_a_block_that_is_worked_on_no_more(monkeypatch):
     now = time.time()
     monkeypatch.setattr("surfkit.apps.status.time", SimpleNamespace(time=lambda: now))
-    state = {name: getattr(RUNNING, name) for name in KNOWN}
-    there = [Block(0, 9, **state | {"heard": now - ago, "began": now - 200}) for ago in (100, 0)]
+    state = {name: getattr(RUNNING, name) for name in SHOWN_FIELDS}
+    there = [BlockStatus(0, 9, **state | {"heard": now - ago, "began": now - 200}) for ago in (100, 0)]
     (_, silent), (_, heard) = [row for row in rows(Status("stopped", blocks=tuple(there))) if row[0] == "block 0"]
     assert "running, but silent for 1:40, step 130 of 300" in silent and "left" not in silent
     assert "silent" not in heard and "5:40 left" in heard
@@ -63,7 +63,7 @@ def test_time_left_of_all_blocks():
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch):
-    monkeypatch.setattr("surfkit.runs.blocks.display.PLAIN_EVERY_S", 0.02)
+    monkeypatch.setattr("surfkit.runs.blocks.display.BOARD_LINE_EVERY_S", 0.02)
     text, began = io.StringIO(), time.monotonic()
     with BlockDisplay(lambda: BlockProgress(STATES, 300, 2), Console(file=text)):
         wait_until(lambda: text.getvalue().count("\n") > 4)
@@ -82,7 +82,7 @@ def test_a_table_on_a_terminal():
 
 
 def test_a_larger_display_gets_the_sum(monkeypatch):
-    monkeypatch.setattr("surfkit.runs.blocks.display.DRAW_EVERY_S", 0.01)
+    monkeypatch.setattr("surfkit.runs.blocks.display.BOARD_EVERY_S", 0.01)
     seen = []
     with progress.outer(lambda *line: seen.append(line)), BlockDisplay(lambda: BlockProgress(STATES, 300)):
         wait_until(lambda: seen)

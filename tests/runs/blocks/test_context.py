@@ -20,8 +20,15 @@ from surfkit.partition import PictureShare
 from surfkit.raster.select import select
 from surfkit.runs.blocks import forecast as forecasts
 from surfkit.runs.blocks import schedule, worker
-from surfkit.runs.blocks.block import Block
-from surfkit.runs.blocks.forecast import FROZEN_BYTES, POINT_BYTES, BlockPoints, forecast, initial_points, point_memory
+from surfkit.runs.blocks.block import BlockRun
+from surfkit.runs.blocks.forecast import (
+    FROZEN_POINT_BYTES,
+    TRAINED_POINT_BYTES,
+    BlockPoints,
+    forecast,
+    initial_points,
+    point_memory,
+)
 from surfkit.runs.blocks.schedule import Compute
 from surfkit.runs.execute import Pool
 from surfkit.runs.execute.state import read_state
@@ -58,7 +65,7 @@ def block_state(out, index):
 
 def coarse_and_plan(out):
     coarse = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
-    return coarse, read_json(out / "blocks" / "plan.json", schedule.Record).plan
+    return coarse, read_json(out / "blocks" / "plan.json", schedule.BlocksRecord).plan
 
 
 def test_frozen_points_end_as_the_coarse_model_has_them(runs):
@@ -201,13 +208,13 @@ def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     ctx = worker.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
-    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 0
+    assert worker.train_block(ctx, BlockRun(loaded, plan, 0)) == 0
     again = block_state(tmp_path / "run", 0)
     assert all(torch.equal(value, again.points.params[name]) for name, value in true.points.params.items())
     map_path(made.path, plan.blocks[0].views[0]).unlink()
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
+    assert worker.train_block(ctx, BlockRun(loaded, plan, 0)) == 2, "its own it does need"
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,7 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path, capsys):
         place = replace(loaded, out=tmp_path / context, recipe=replace(growing, context=context))
         (place.out / "pretrain").mkdir(parents=True)
         os.link(runs["frozen"] / "pretrain" / "checkpoint.safetensors", place.out / "pretrain/checkpoint.safetensors")
-        block = Block(place, plan, 0)
+        block = BlockRun(place, plan, 0)
         told = forecast([block], worker.open_coarse_model(place), [])
         found[context] = Found(point_memory(block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.planned.points, block.planned.begins
@@ -237,22 +244,22 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path, capsys):
         }
         assert initial_points(block) == wanted[context]
         block.write(begun_points=own + 7 if context == "frozen" else both + 7)
-        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * POINT_BYTES
+        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * TRAINED_POINT_BYTES
         assert point_memory(block) - found[context].memory == more
     held = {"peak": 10_000_000, "photographs": 4_000_000, "points": 1_000_000, "steps": 5_000_000}
     (place.out / "run.json").write_text(json.dumps({"gpu_memory_bytes": held}))
     told_of_gpu = forecast([block], worker.open_coarse_model(place), [])
     assert told.gpu_bytes == 0 and told_of_gpu.memory_bytes == 0
     assert told_of_gpu.gpu_bytes == initial_points(block).bytes(
-        6e6 / len(coarse.points), 3e6 / len(coarse.points), forecasts.GROWN
+        6e6 / len(coarse.points), 3e6 / len(coarse.points), forecasts.DENSIFIED_GROWTH
     )
     forecasts.report_forecast(place.out, told_of_gpu)
     assert (
         f"a block needs up to {told_of_gpu.gpu_bytes / 1e6:.0f} MB of the memory of its GPU" in capsys.readouterr().err
     )
     around = plan.blocks[0].begins - plan.blocks[0].points
-    assert found["densified"].memory - found["tuned"].memory == 2 * around * POINT_BYTES
-    less = POINT_BYTES - FROZEN_BYTES
+    assert found["densified"].memory - found["tuned"].memory == 2 * around * TRAINED_POINT_BYTES
+    less = TRAINED_POINT_BYTES - FROZEN_POINT_BYTES
     assert found["tuned"].memory - found["frozen"].memory == around * less
     pace = coarse.seconds / coarse.index
     assert found["densified"].seconds == found["tuned"].seconds == pytest.approx(STEPS * pace)

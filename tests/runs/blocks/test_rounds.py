@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.losses.consensus import Consensus, column
 from surfkit.partition import PictureShare
 from surfkit.runs.blocks import rounds, worker
-from surfkit.runs.blocks.block import Block, agreement_file, read_plan, rounds_agreed
+from surfkit.runs.blocks.block import BlockRun, agreement_file, read_plan, rounds_agreed
 from surfkit.runs.blocks.schedule import Compute, Unfinished
 from surfkit.runs.execute.base import Inline, JobResult
 from surfkit.runs.pipeline import opened, run, with_steps
@@ -100,7 +100,7 @@ def test_killed_while_blocks_agree(whole, data, agreeing, tmp_path, monkeypatch,
         run(agreeing, data, tmp_path, Compute("cpu"), EVERY)
     if after:
         loaded = opened(tmp_path)
-        block = Block(loaded, read_plan(loaded).plan, 1)
+        block = BlockRun(loaded, read_plan(loaded).plan, 1)
         assert block.goal == 2 * ROUND and not block.is_done
         state = rounds.take_in(block, checkpoint.load(block.stage.checkpoint))
         assert rounds.take_in(block, state) is state, "once only"

@@ -14,7 +14,7 @@ from two_blocks import EVERY, same
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.runs.blocks import schedule, worker
-from surfkit.runs.blocks.block import Block, read_plan
+from surfkit.runs.blocks.block import BlockRun, read_plan
 from surfkit.runs.blocks.schedule import Compute
 from surfkit.runs.blocks.worker import heartbeats
 from surfkit.runs.execute.base import Job, JobResult
@@ -27,10 +27,10 @@ LATER_S = 3600.0
 
 
 @pytest.fixture
-def block(undisturbed, tmp_path) -> Block:
+def block(undisturbed, tmp_path) -> BlockRun:
     """A block of a run, in a folder of its own."""
     loaded = opened(undisturbed)
-    return Block(replace(loaded, out=tmp_path), read_plan(loaded).plan, 0)
+    return BlockRun(replace(loaded, out=tmp_path), read_plan(loaded).plan, 0)
 
 
 def test_heartbeats_while_no_step_is_made(block, monkeypatch):
@@ -75,7 +75,7 @@ def elsewhere(undisturbed, tmp_path):
 
 def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
     folder = elsewhere(-LATER_S)
-    assert main(["tune", str(folder), "0"]) == worker.BUSY
+    assert main(["tune", str(folder), "0"]) == worker.BUSY_STATUS
     assert (
         "process 7 on far sent a heartbeat" in capsys.readouterr().err
         and read_state(folder / "blocks/000").host == "far"
@@ -91,7 +91,9 @@ def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
     for seconds, status in ((-LATER_S, "running"), (STALE_S, "failed")):
         folder = elsewhere(seconds)
         loaded = opened(folder)
-        assert schedule.record_failure(Block(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
+        assert (
+            schedule.record_failure(BlockRun(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
+        )
         assert read_state(folder / "blocks" / "000").status == status
 
 
@@ -103,7 +105,7 @@ def test_a_worker_elsewhere_that_falls_silent_is_waited_for_no_more(elsewhere, m
         looks.append(place)
         if len(looks) == 2:
             elsewhere(STALE_S + 1)
-            now[0] += 2 * schedule.LEAVE_S
+            now[0] += 2 * schedule.WORKER_EXIT_S
         return find(place)
 
     monkeypatch.setattr(schedule, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=lambda seconds: None))
@@ -113,7 +115,7 @@ def test_a_worker_elsewhere_that_falls_silent_is_waited_for_no_more(elsewhere, m
 
 
 def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):
-    monkeypatch.setattr(schedule, "LEAVE_S", 0.2)
+    monkeypatch.setattr(schedule, "WORKER_EXIT_S", 0.2)
     folder = elsewhere(STALE_S - 3)
     run(recipe, data, folder, Compute("cpu"), EVERY)
     assert same(folder, undisturbed)

@@ -15,8 +15,8 @@ import pytest
 
 from surfkit.runs.execute import remote
 from surfkit.runs.execute.base import LOG, Job
-from surfkit.runs.execute.remote import Outcome, RemoteJob, run_remote_job
-from surfkit.runs.execute.shared import MARK, mark_folder, remote_job
+from surfkit.runs.execute.remote import RemoteJob, RemoteResult, run_remote_job
+from surfkit.runs.execute.shared import MARK_PREFIX, mark_folder, remote_job
 
 HOST = socket.gethostname()
 
@@ -30,22 +30,22 @@ def test_an_errand_is_run(tmp_path, monkeypatch):
     seen = "import json, os\nnames = 'OMP_NUM_THREADS', 'CUDA_VISIBLE_DEVICES'\n"
     seen += "print(json.dumps([os.environ[name] for name in names]))"
     with mark_folder([job(tmp_path, "")]) as mark:
-        assert remote_job(job(tmp_path, seen), mark, 2, gpu=False)() == Outcome(0, HOST)
-        assert remote_job(job(tmp_path, f"{seen}\nraise SystemExit(3)"), mark, 1, gpu=True)() == Outcome(3, HOST)
+        assert remote_job(job(tmp_path, seen), mark, 2, gpu=False)() == RemoteResult(0, HOST)
+        assert remote_job(job(tmp_path, f"{seen}\nraise SystemExit(3)"), mark, 1, gpu=True)() == RemoteResult(3, HOST)
     lines = (tmp_path / "000" / LOG).read_text().splitlines()
     assert list(map(json.loads, lines)) == [["2", ""], ["1", "3"]]
 
 
 def test_another_disk(tmp_path):
     """The folders are there, but the mark is not: they are others of the same name."""
-    (tmp_path / f"{MARK}of-a-driver-that-was-killed").touch()
+    (tmp_path / f"{MARK_PREFIX}of-a-driver-that-was-killed").touch()
     with mark_folder([job(tmp_path, "")]) as mark:
         assert [path.name for path in tmp_path.iterdir()] == [mark.name]
         made = remote_job(job(tmp_path, ""), mark, 1, gpu=False)
     found = made()
     assert found.status == 2
     assert found.why.startswith(f"machine {HOST}: {mark} is not there; run folder and data set must lie")
-    assert not list(tmp_path.glob(f"{MARK}*")) and not (tmp_path / "000" / LOG).exists()
+    assert not list(tmp_path.glob(f"{MARK_PREFIX}*")) and not (tmp_path / "000" / LOG).exists()
 
 
 def test_killed_for_lack_of_memory(tmp_path, monkeypatch):
@@ -54,8 +54,8 @@ def test_killed_for_lack_of_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(remote, "oom_kills", lambda: next(kills))
     with mark_folder([job(tmp_path, "")]) as mark:
         made = remote_job(job(tmp_path, "import os; os.kill(os.getpid(), 9)"), mark, 1, gpu=False)
-        assert made() == Outcome(-9, HOST, kind="oom")
-        assert replace(made, process=None)() == Outcome(-9, HOST)
+        assert made() == RemoteResult(-9, HOST, kind="oom")
+        assert replace(made, process=None)() == RemoteResult(-9, HOST)
 
 
 def test_another_version(tmp_path):

@@ -115,7 +115,7 @@ def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     thread.start()
     (end,) = Slurm("local").run([job(tmp_path, 0, SAVING)])
     thread.join()
-    assert end.status == slurm.CRASHED and "came to no result" in end.why
+    assert end.status == slurm.CRASHED_STATUS and "came to no result" in end.why
     wait_for((folder / "saved").exists)
 
 
@@ -171,7 +171,7 @@ def cluster(tmp_path, monkeypatch):
     (tmp_path / "queue").write_text("17_0 PENDING Priority\n17_1 PENDING PartitionTimeLimit\n")
     monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
     monkeypatch.setattr(slurm, "SLURM_POLL_S", 0.01)
-    monkeypatch.setattr(slurm, "ASK_S", 0.05)
+    monkeypatch.setattr(slurm, "QUERY_INTERVAL_S", 0.05)
     return tmp_path
 
 
@@ -190,7 +190,7 @@ def test_what_slurm_is_told(cluster, capsys):
     thread = threading.Thread(target=later)
     thread.start()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(slurm, "ARRIVE_S", 0.3)
+        patch.setattr(slurm, "RESULT_ARRIVAL_S", 0.3)
         lost = next(running)
     thread.join()
     running.close()
@@ -199,7 +199,7 @@ def test_what_slurm_is_told(cluster, capsys):
     for option in [*wanted, "account=maps", "signal=USR2@90", "job-name='surfkit-my run'"]:
         assert f"#SBATCH --{option}\n" in script, option
     assert "#SBATCH --exclusive\n" in script and "#SBATCH --requeue\n" in script
-    assert (lost.job.index, lost.status, lost.kind) == (0, slurm.CRASHED, "oom")
+    assert (lost.job.index, lost.status, lost.kind) == (0, slurm.CRASHED_STATUS, "oom")
     assert "job 17_1 is OUT_OF_MEMORY (OutOfMemory) in Slurm" in lost.why
     asked = (cluster / "asked").read_text().splitlines()
     assert asked[-1] == "scancel 17_0" and "scancel 17_1" not in asked
@@ -230,7 +230,7 @@ def test_what_slurm_does_not_take(cluster):
 
 def test_what_a_person_cancels_stays_so(cluster, monkeypatch):
     (cluster / "queue").write_text("17 CANCELLED None\n")
-    monkeypatch.setattr(slurm, "ARRIVE_S", 0.3)
+    monkeypatch.setattr(slurm, "RESULT_ARRIVAL_S", 0.3)
     (end,) = Slurm().run([job(cluster / "blocks", 0)])
     assert end.status == 1
 

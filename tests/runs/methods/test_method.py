@@ -20,7 +20,7 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.splats.ply import read_splats
-from surfkit.mesh.fusion import TILES
+from surfkit.mesh.fusion import TILES_PATTERN
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import QuantileGrid
@@ -31,7 +31,7 @@ from surfkit.runs.pipeline import run, with_steps
 from surfkit.runs.recipe import Recipe
 from surfkit.study.ablation import Row, Table, build
 from surfkit.study.recipes.surface import STEREO, SURFACE
-from surfkit.study.study import Plan, ablate, trials
+from surfkit.study.study import AblationPlan, ablate, trials
 from surfkit.testing import check_method
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -328,14 +328,14 @@ def test_a_table_compares_methods_with_splats(data, tmp_path):
     )
     recipes = build(table)
     assert recipes["plane"].mesh is None and recipes["mean"].mesh == base.mesh and recipes["mean"].pretrain == stage
-    report = ablate(Plan(table, (data,), tmp_path, device="cpu"), _Silent())
+    report = ablate(AblationPlan(table, (data,), tmp_path, device="cpu"), _Silent())
     splats, plane, mean = rows = report["data_sets"][0]["rows"]
     assert not [row["failed"] for row in rows if row["failed"]]
     assert set(plane["mean"]) == {"seconds", "cpu_seconds", "peak_memory_bytes"}
     assert set(mean["mean"]) == {*plane["mean"], "psnr", "ssim", "fps"}
     assert "points" in splats["mean"] and set(mean["difference"]) == set(mean["mean"])
     assert "| 2 | (plane) |" in (tmp_path / "ablation.md").read_text()
-    lengths = [trial.recipe.length for trial in trials(Plan(table, (data,), tmp_path, steps=6))]
+    lengths = [trial.recipe.length for trial in trials(AblationPlan(table, (data,), tmp_path, steps=6))]
     assert lengths == [6, 4, None]
     wrong = replace(table, rows=(Row("both", {"method": Lower(), "pretrain.steps": 7}),))
     with pytest.raises(BadInput, match="row 'both': pretrain.steps: method:lower does not use it"):
@@ -361,7 +361,7 @@ def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys, monkeypat
     splats = evolve(Recipe(depth=SWEEP, pretrain=replace(Recipe().pretrain, steps=1), mesh=mesher), "seed", 0)
     run(splats, data, tmp_path / "splats")
     alone = Recipe(depth=SWEEP, method=StereoFusion(mesher=mesher))
-    left = tmp_path / "alone" / "method" / TILES.replace("*", "killed")
+    left = tmp_path / "alone" / "method" / TILES_PATTERN.replace("*", "killed")
 
     def killed(self, given):
         left.mkdir(parents=True)

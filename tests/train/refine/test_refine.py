@@ -13,7 +13,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import components
 from surfkit.core.tree import evolve
-from surfkit.densify.prune import Importance
+from surfkit.densify.prune import PruneByImportance
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.io.splats.ply import read_splats
@@ -28,7 +28,7 @@ from surfkit.runs.pipeline import load_run, run, with_steps
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.stage import Intervals, drawing, return_to_checkpoint
 from surfkit.runs.status import status
-from surfkit.study.recipes.city import FIRST
+from surfkit.study.recipes.city import CITY_FIRST
 from surfkit.testing import check_refine
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -258,9 +258,9 @@ def test_cameras_beside_those_of_the_photographs(data):
 
 
 def test_citygaussian():
-    recover, distil = FIRST.refine
-    assert recover.stage.prune == (Importance(at=(0,), ratio=0.5),) and recover.stage.steps == 30_000
-    assert with_steps(FIRST, 1_000).refine[0].stage.prune[0].at == (0,), "at once, whatever the length"
+    recover, distil = CITY_FIRST.refine
+    assert recover.stage.prune == (PruneByImportance(at=(0,), ratio=0.5),) and recover.stage.steps == 30_000
+    assert with_steps(CITY_FIRST, 1_000).refine[0].stage.prune[0].at == (0,), "at once, whatever the length"
     for rates, stage, fall, each in ((RECOVERY, recover.stage, 0.95, 400), (DISTILLATION, distil.stage, 0.9, 500)):
         ratio = rates["sh0"].at(each * 2, stage.steps) / rates["sh0"].at(each, stage.steps)
         assert ratio == pytest.approx(fall, rel=1e-3)

@@ -6,13 +6,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from surfkit.apps.report.elements import Cell, Element, Prose, Section, Table
-from surfkit.apps.report.source import Source, read_source
-from surfkit.apps.report.values import NONE, QUANTITIES, in_words, mapping, number, numeric, plain, quantity, value_at
+from surfkit.apps.report.elements import Element, Prose, Section, TableCell, TableElement
+from surfkit.apps.report.source import RunFiles, read_source
+from surfkit.apps.report.values import (
+    NO_VALUE,
+    QUANTITIES,
+    in_words,
+    mapping,
+    number,
+    numeric,
+    plain,
+    quantity,
+    value_at,
+)
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 
-NAME = "ablation.json"
+ABLATION_FILE = "ablation.json"
 CAPTION = (
     "Means over the seeds ± standard deviation. Below them is the difference to the row that a row is built on, ± its "
     "standard error. Rows in brackets were tried and given up; later rows do not build on them."
@@ -29,11 +39,12 @@ def read_table(folder: Path) -> dict[str, Any]:
     Raises:
         BadInput: It is damaged.
     """
-    report = read_json(folder / NAME, dict[str, Any])
+    report = read_json(folder / ABLATION_FILE, dict[str, Any])
     entries = report.get("data_sets")
     if not isinstance(entries, list) or not entries or not all(_has_rows(entry) for entry in entries):
         raise BadInput(
-            f"{folder / NAME}: data_sets is no list of data sets, each with rows that have labels; give the surfkit "
+            f"{folder / ABLATION_FILE}: data_sets is no list of data sets, each with rows that have labels; give the "
+            f"surfkit "
             "ablate command again"
         )
     return report
@@ -50,9 +61,9 @@ def data_set_name(report: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
     return Path(path).name if isinstance(path, str) and len(report["data_sets"]) > 1 else ""
 
 
-def row_runs(folder: Path, report: Mapping[str, Any]) -> dict[Place, Source]:
+def row_runs(folder: Path, report: Mapping[str, Any]) -> dict[Place, RunFiles]:
     """The run of the first seed of each row that has one, by the positions of data set and row."""
-    found: dict[Place, Source] = {}
+    found: dict[Place, RunFiles] = {}
     for which, entry in enumerate(report["data_sets"]):
         beside = f", {name}" if (name := data_set_name(report, entry)) else ""
         for at, row in enumerate(entry["rows"]):
@@ -64,7 +75,7 @@ def row_runs(folder: Path, report: Mapping[str, Any]) -> dict[Place, Source]:
     return found
 
 
-def table_section(report: Mapping[str, Any], runs: Mapping[Place, Source]) -> Section:
+def table_section(report: Mapping[str, Any], runs: Mapping[Place, RunFiles]) -> Section:
     """A table of each data set with every quantity that a row has, then the published figures, then what each row
     changes."""
     rows = report["data_sets"][0]["rows"]
@@ -76,7 +87,7 @@ def table_section(report: Mapping[str, Any], runs: Mapping[Place, Source]) -> Se
     return Section("table", "Table", tuple(element for element in elements if element is not None))
 
 
-def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, Source], data_set: str) -> Table:
+def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, RunFiles], data_set: str) -> TableElement:
     """The rows on one data set."""
     names = _names(rows, "mean")
     cells, dimmed = [], tuple(at for at, row in enumerate(rows) if row.get("given_up"))
@@ -90,10 +101,10 @@ def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, Source], data_s
             note = f"mesh of another program: {file}"
         if isinstance(other := row.get("not_as_named"), str):
             note = f"not run as named: {other}"
-        first = (Cell(f"{at + 1}. {label}", at, note, link), Cell(str(len(seeds)), len(seeds)))
+        first = (TableCell(f"{at + 1}. {label}", at, note, link), TableCell(str(len(seeds)), len(seeds)))
         cells.append((*first, *(_cell(row, name) for name in names)))
     head = ("row", "seeds", *(quantity(name).label for name in names))
-    return Table(f"{data_set}: {CAPTION}" if data_set else CAPTION, head, tuple(cells), True, dimmed)
+    return TableElement(f"{data_set}: {CAPTION}" if data_set else CAPTION, head, tuple(cells), True, dimmed)
 
 
 def _names(rows: Sequence[Mapping[str, Any]], key: str) -> list[str]:
@@ -112,19 +123,21 @@ def _about(report: Mapping[str, Any]) -> str:
     return f"{about}. {told}." if isinstance(about, str) else f"{told}."
 
 
-def _cell(row: Mapping[str, Any], name: str) -> Cell:
+def _cell(row: Mapping[str, Any], name: str) -> TableCell:
     """Mean and standard deviation, and below them the difference."""
     what, mean, deviation = quantity(name), number(row, "mean", name), number(row, "sd", name)
     if mean is None:
-        return Cell(NONE)
+        return TableCell(NO_VALUE)
     text = what.shown(mean) + (f" ± {what.shown(deviation)}" if deviation is not None else "")
     change, base = number(row, "difference", name, "mean"), number(row, "difference", name, "base")
     if change is None or base is None:
-        return Cell(text, mean)
-    return Cell(text, mean, what.difference(base + change, base, number(row, "difference", name, "standard_error")))
+        return TableCell(text, mean)
+    return TableCell(
+        text, mean, what.difference(base + change, base, number(row, "difference", name, "standard_error"))
+    )
 
 
-def _published(rows: Sequence[Mapping[str, Any]]) -> Table | None:
+def _published(rows: Sequence[Mapping[str, Any]]) -> TableElement | None:
     """The figures of the paper, and the difference between its rows."""
     names = _names(rows, "paper")
     cells = []
@@ -138,17 +151,19 @@ def _published(rows: Sequence[Mapping[str, Any]]) -> Table | None:
             )
             for name, value, change in values
         ]
-        cells.append((Cell(f"{at + 1}. {row['label']}", at), *shown))
+        cells.append((TableCell(f"{at + 1}. {row['label']}", at), *shown))
     head = ("row", *(quantity(name).label for name in names))
-    return Table("Published figures of the rows", head, tuple(cells), True) if names else None
+    return TableElement("Published figures of the rows", head, tuple(cells), True) if names else None
 
 
-def _changes(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _changes(rows: Sequence[Mapping[str, Any]]) -> TableElement:
     cells = []
     for at, row in enumerate(rows):
         own = ["a recipe of its own"] if row.get("own_recipe") is True else []
         own += [f"{path} = {in_words(value)}" for path, value in mapping(row, "change").items()]
         changes = "; ".join(own)
         base = row.get("built_on")
-        cells.append(plain(f"{at + 1}. {row['label']}", base if isinstance(base, str) else NONE, changes or NONE))
-    return Table("What each row changes", ("row", "built on", "settings"), tuple(cells))
+        cells.append(
+            plain(f"{at + 1}. {row['label']}", base if isinstance(base, str) else NO_VALUE, changes or NO_VALUE)
+        )
+    return TableElement("What each row changes", ("row", "built on", "settings"), tuple(cells))

@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from surfkit.apps.report.elements import Cell, Element, Figure, Group, Picture, Section, Table
+from surfkit.apps.report.elements import (
+    Element,
+    ElementGroup,
+    EmbeddedPicture,
+    Figure,
+    Section,
+    TableCell,
+    TableElement,
+)
 from surfkit.apps.report.sections.notes import reduced
-from surfkit.apps.report.source import Source, heading
-from surfkit.apps.report.values import NONE, number, numeric, value_at
+from surfkit.apps.report.source import RunFiles, heading
+from surfkit.apps.report.values import NO_VALUE, number, numeric, value_at
 from surfkit.core.codec import read_json
 
 
-def blocks(runs: Sequence[Source], with_pictures: bool) -> Section | None:
+def blocks(runs: Sequence[RunFiles], with_pictures: bool) -> Section | None:
     """The blocks of each run that has some."""
     groups = []
     for run in runs:
@@ -21,12 +29,12 @@ def blocks(runs: Sequence[Source], with_pictures: bool) -> Section | None:
             picture = run.out / "blocks" / "plan.png"
             if with_pictures and picture.is_file():
                 caption = "from above: points in the colour of their block, cameras as rings"
-                elements.append(Figure(Picture(picture, f"blocks of {run.name} from above"), caption))
-            groups.append(Group(heading(run, runs), (*elements, _table(run)), run.id("blocks")))
+                elements.append(Figure(EmbeddedPicture(picture, f"blocks of {run.name} from above"), caption))
+            groups.append(ElementGroup(heading(run, runs), (*elements, _table(run)), run.id("blocks")))
     return Section("blocks", "Blocks", tuple(groups)) if groups else None
 
 
-def _table(run: Source) -> Table:
+def _table(run: RunFiles) -> TableElement:
     planned, merged = value_at(run.plan, "plan", "blocks"), _merged(run)
     rows = []
     for at, block in enumerate(planned if isinstance(planned, list) else ()):
@@ -36,18 +44,25 @@ def _table(run: Source) -> Table:
         counts = (len(views) if isinstance(views, list) else None, number(state, "step"), number(state, "attempts"))
         kept = number(merged.get(at), "kept")
         cells = [numeric(value, "" if value is None else f"{value:,.0f}") for value in (*counts, kept)]
-        rows.append((Cell(str(at), at), Cell(_text(state, "status") or NONE), *cells, Cell(trouble or NONE)))
+        rows.append(
+            (
+                TableCell(str(at), at),
+                TableCell(_text(state, "status") or NO_VALUE),
+                *cells,
+                TableCell(trouble or NO_VALUE),
+            )
+        )
     head = ("block", "state", "views", "steps", "attempts", "points after merging", "errors and fallbacks")
-    return Table("Blocks", head, tuple(rows), is_sortable=True)
+    return TableElement("Blocks", head, tuple(rows), is_sortable=True)
 
 
-def _merged(run: Source) -> dict[int, Any]:
+def _merged(run: RunFiles) -> dict[int, Any]:
     """What the merge says of each block, by its number."""
     found = _json(run, "merge.json").get("blocks")
     return {at: one for one in found if (at := value_at(one, "index")) is not None} if isinstance(found, list) else {}
 
 
-def _json(run: Source, name: str) -> dict[str, Any]:
+def _json(run: RunFiles, name: str) -> dict[str, Any]:
     path = run.out / "blocks" / name
     return read_json(path, dict[str, Any]) if path.exists() else {}
 

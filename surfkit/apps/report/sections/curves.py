@@ -6,9 +6,9 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from surfkit.apps.report.charts import Line, chart
-from surfkit.apps.report.elements import Chart, Details, Element, Group, Row, Section
-from surfkit.apps.report.source import Part, Source, total_loss
+from surfkit.apps.report.charts import ChartSeries, chart
+from surfkit.apps.report.elements import Details, Element, ElementGroup, ElementRow, LineChart, Section
+from surfkit.apps.report.source import JournaledStage, RunFiles, total_loss
 from surfkit.apps.report.values import mapping, number
 
 Value = Callable[[dict[str, Any]], float | None]
@@ -38,7 +38,7 @@ def mean_psnr(line: dict[str, Any]) -> float | None:
     return statistics.fmean(values) if values else None
 
 
-WHAT: tuple[tuple[str, Value, str], ...] = (
+CURVES: tuple[tuple[str, Value, str], ...] = (
     ("Sum of the weighted losses", total_loss, "StepDone"),
     ("Points", points, "StepDone"),
     ("Mean PSNR of a few held-out views, dB", mean_psnr, "Measured"),
@@ -47,9 +47,9 @@ WHAT: tuple[tuple[str, Value, str], ...] = (
 )
 
 
-def curves(runs: Sequence[Source]) -> Section | None:
+def curves(runs: Sequence[RunFiles]) -> Section | None:
     """Charts of the first stage of all runs, of each loss, and of the blocks and refinements of each run."""
-    elements: list[Element] = charts([(run.name, run.first) for run in runs], WHAT)
+    elements: list[Element] = charts([(run.name, run.first) for run in runs], CURVES)
     for run in runs:
         more = [*_losses(run), *_parts(run)]
         if more and len(runs) > 1:
@@ -58,32 +58,32 @@ def curves(runs: Sequence[Source]) -> Section | None:
     return Section("curves", "Curves", tuple(elements)) if elements else None
 
 
-def charts(parts: Sequence[tuple[str, Part]], what: Sequence[tuple[str, Value, str]]) -> list[Element]:
+def charts(parts: Sequence[tuple[str, JournaledStage]], what: Sequence[tuple[str, Value, str]]) -> list[Element]:
     """A chart for each quantity that any of the parts has, a line for each part; none if there are no steps."""
     found = []
     for title, value, event in what:
         series = [(name, part.series(value, event)) for name, part in parts]
-        lines = [Line(name, dots) for name, dots in series if dots is not None]
+        lines = [ChartSeries(name, dots) for name, dots in series if dots is not None]
         if lines:
             found.append(chart(title, lines))
-    return [Row(tuple(found), size="wide")] if found else []
+    return [ElementRow(tuple(found), size="wide")] if found else []
 
 
-def _losses(run: Source) -> list[Chart]:
+def _losses(run: RunFiles) -> list[LineChart]:
     """Each loss of the first stage."""
     last = next(iter(reversed(run.first.of("StepDone"))), {})
     names = list(mapping(last, "losses"))
     series = [(name, run.first.series(lambda line, name=name: number(line, "losses", name))) for name in names]
-    lines = [Line(name, dots) for name, dots in series if dots is not None]
+    lines = [ChartSeries(name, dots) for name, dots in series if dots is not None]
     return [chart("Weighted losses, one by one", lines)] if len(lines) > 1 else []
 
 
-def _parts(run: Source) -> list[Element]:
+def _parts(run: RunFiles) -> list[Element]:
     """Blocks, and refinements, each in charts of their own."""
     refinements = [part for part in run.parts if part.title.startswith("refinement ")]
     found: list[Element] = []
     for title, parts in (("Blocks", run.blocks), ("Refinements", refinements)):
-        drawn = charts([(part.title, part) for part in parts], WHAT[:2])
+        drawn = charts([(part.title, part) for part in parts], CURVES[:2])
         if drawn:
-            found.append(Group(f"{title} of {run.name}", tuple(drawn)))
+            found.append(ElementGroup(f"{title} of {run.name}", tuple(drawn)))
     return found

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from surfkit.apps.report.elements import Group, Listing, Prose, Section
-from surfkit.apps.report.source import Part, Source, heading
+from surfkit.apps.report.elements import ElementGroup, Listing, Prose, Section
+from surfkit.apps.report.source import JournaledStage, RunFiles, heading
 from surfkit.apps.report.values import number, texts, value_at
 
 MISSING = {
@@ -16,21 +16,21 @@ MISSING = {
 """Reasons that metrics.json gives."""
 
 
-def notes(runs: Sequence[Source]) -> Section:
+def notes(runs: Sequence[RunFiles]) -> Section:
     """Every note once: a list for each set of runs that share some, the largest set first."""
-    noting: dict[str, list[Source]] = {}
+    noting: dict[str, list[RunFiles]] = {}
     for run in runs:
         for text in texts_of(run):
             noting.setdefault(text, []).append(run)
     lists: dict[str, list[str]] = {}
     for text, some in sorted(noting.items(), key=lambda item: -len(item[1])):
         lists.setdefault(_title(some, runs), []).append(text)
-    groups = tuple(Group(title, (Listing(tuple(found)),)) for title, found in lists.items())
+    groups = tuple(ElementGroup(title, (Listing(tuple(found)),)) for title, found in lists.items())
     nothing = Prose("Nothing was left out, replaced or lowered.")
     return Section("notes", "Notes and automatic changes", groups or (nothing,))
 
 
-def _title(some: Sequence[Source], runs: Sequence[Source]) -> str:
+def _title(some: Sequence[RunFiles], runs: Sequence[RunFiles]) -> str:
     """Which of the runs they are, in few words; "" where there is only one run."""
     others = [run for run in runs if run not in some]
     if others and len(others) < len(some):
@@ -38,7 +38,7 @@ def _title(some: Sequence[Source], runs: Sequence[Source]) -> str:
     return "; ".join(heading(run, runs) for run in some) if others or len(runs) == 1 else "All runs"
 
 
-def texts_of(run: Source) -> list[str]:
+def texts_of(run: RunFiles) -> list[str]:
     """Everything that a run notes about itself, each text once."""
     found = [] if run.metrics else ["The run is not finished: there is no metrics.json."]
     found += texts(run.record, "notes")
@@ -56,7 +56,7 @@ def texts_of(run: Source) -> list[str]:
     return [text for text in known if not any(other != text and other.endswith(f": {text}") for other in known)]
 
 
-def _resumed(part: Part) -> list[str]:
+def _resumed(part: JournaledStage) -> list[str]:
     """A text for each time that steps went on after an interruption."""
     firsts = [number(line, "first") for line in part.of("StageBegan")]
     return [f"{part.title} continued after step {first - 1:,.0f}" for first in firsts if first and first > 1]

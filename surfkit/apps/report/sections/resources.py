@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from surfkit.apps.report.elements import Cell, Element, Group, Section, Table
-from surfkit.apps.report.source import Part, Source, heading
-from surfkit.apps.report.values import NONE, as_bytes, as_duration, mapping, number, numeric
+from surfkit.apps.report.elements import Element, ElementGroup, Section, TableCell, TableElement
+from surfkit.apps.report.source import JournaledStage, RunFiles, heading
+from surfkit.apps.report.values import NO_VALUE, as_bytes, as_duration, mapping, number, numeric
 
-MEMORY = "The most memory that was held, by what it was taken by"
-GPU_MEMORY = "The most memory of the GPU that was held, by what it was taken by"
+MEMORY_CAPTION = "The most memory that was held, by what it was taken by"
+GPU_MEMORY_CAPTION = "The most memory of the GPU that was held, by what it was taken by"
 
 
-def resources(runs: Sequence[Source]) -> Section | None:
+def resources(runs: Sequence[RunFiles]) -> Section | None:
     """Tables of each run."""
     groups = []
     for run in runs:
         elements = [*_stages(run), *_memory(run)]
         if elements:
-            groups.append(Group(heading(run, runs), tuple(elements), run.id("resources")))
+            groups.append(ElementGroup(heading(run, runs), tuple(elements), run.id("resources")))
     return Section("resources", "Time and memory", tuple(groups)) if groups else None
 
 
-def seconds_of(part: Part) -> float | None:
+def seconds_of(part: JournaledStage) -> float | None:
     """Wall time of the steps of a part; of all its attempts, as far as they came to their end, else by its journal."""
     ended = [number(line, "seconds") for line in part.of("StageEnded")]
     known = [seconds for seconds in ended if seconds is not None]
@@ -32,7 +32,7 @@ def seconds_of(part: Part) -> float | None:
     return times[-1] - times[0] if len(times) > 1 else None
 
 
-def _stages(run: Source) -> list[Element]:
+def _stages(run: RunFiles) -> list[Element]:
     rows: list[tuple[str, float | None, float | None, float | None, float | None, float | None]] = []
     if (prepared := number(run.metrics, "prepare_cpu_seconds")) or (
         prepared := number(run.record, "prepare_cpu_seconds")
@@ -50,27 +50,29 @@ def _stages(run: Source) -> list[Element]:
     with_gpu = any(row[5] for row in rows)
     cells = [
         (
-            Cell(name, at),
-            Cell(NONE) if took is None else Cell(as_duration(took), took, share=took / longest if longest else 0.0),
+            TableCell(name, at),
+            TableCell(NO_VALUE)
+            if took is None
+            else TableCell(as_duration(took), took, share=took / longest if longest else 0.0),
             *(numeric(value, "" if value is None else f"{value:,.0f}") for value in (steps, points)),
             *(numeric(value, "" if value is None else as_bytes(value)) for value in held[: 1 + with_gpu]),
         )
         for at, (name, took, steps, points, *held) in enumerate(rows)
     ]
     head = ("part", "time", "steps", "points", "peak memory", *["peak GPU memory"] * with_gpu)
-    return [Table("Time and memory by stage", head, tuple(cells), is_sortable=True)] if cells else []
+    return [TableElement("Time and memory by stage", head, tuple(cells), is_sortable=True)] if cells else []
 
 
-def _memory(run: Source) -> list[Element]:
-    return [*_parts(run, "memory_bytes", MEMORY), *_parts(run, "gpu_memory_bytes", GPU_MEMORY)]
+def _memory(run: RunFiles) -> list[Element]:
+    return [*_parts(run, "memory_bytes", MEMORY_CAPTION), *_parts(run, "gpu_memory_bytes", GPU_MEMORY_CAPTION)]
 
 
-def _parts(run: Source, kind: str, title: str) -> list[Element]:
+def _parts(run: RunFiles, kind: str, title: str) -> list[Element]:
     found = mapping(run.metrics, kind) or mapping(run.record, kind)
     parts = {name: value for name in found if name != "peak" and (value := number(found, name)) is not None}
     most = max(parts.values(), default=0.0)
     rows = [
-        (Cell(name), Cell(as_bytes(value), value, share=max(0.0, value) / most if most > 0 else 0.0))
+        (TableCell(name), TableCell(as_bytes(value), value, share=max(0.0, value) / most if most > 0 else 0.0))
         for name, value in parts.items()
     ]
-    return [Table(title, ("part", "memory"), tuple(rows), is_sortable=True)] if rows else []
+    return [TableElement(title, ("part", "memory"), tuple(rows), is_sortable=True)] if rows else []

@@ -9,31 +9,31 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from surfkit.apps.report.elements import (
-    Cell,
     Compare,
     Details,
     Element,
+    ElementGroup,
+    ElementRow,
+    EmbeddedPicture,
     Figure,
-    Group,
-    Picture,
     Prose,
-    Row,
     Section,
-    Table,
+    TableCell,
+    TableElement,
 )
 from surfkit.apps.report.gallery import image_size
-from surfkit.apps.report.source import Source
+from surfkit.apps.report.source import RunFiles
 from surfkit.apps.report.values import mapping, number, numeric
 from surfkit.evaluate.images.pictures import picture_path
 
-PARTS = ("photograph", "render", "depth", "normals")
+PICTURE_PARTS = ("photograph", "render", "depth", "normals")
 """What a picture of the evaluation has side by side, as far as the method draws it."""
-MOST_OPEN = 2
+MAX_OPEN_RUNS = 2
 """Runs whose depth and normals are shown without being asked for."""
-COLORS = "Depth: near is pale, far is dark. Normals: red to the right, green up, blue towards the camera."
+COLORS_NOTE = "Depth: near is pale, far is dark. Normals: red to the right, green up, blue towards the camera."
 
 
-def held_out(runs: Sequence[Source], views: int) -> Section | None:
+def held_out(runs: Sequence[RunFiles], views: int) -> Section | None:
     """Some views from the worst to the best, and the figures of all; None if nothing was measured.
 
     Args:
@@ -48,26 +48,26 @@ def held_out(runs: Sequence[Source], views: int) -> Section | None:
     for name, word in chosen(runs, names, views):
         elements.append(shown(runs, name, word))
     if elements:
-        elements.append(Prose(COLORS))
+        elements.append(Prose(COLORS_NOTE))
     elements.append(Details(f"Figures of all {len(names)} held-out views", (_table(runs, names),)))
     return Section("views", "Held-out views", tuple(elements))
 
 
-def view_names(runs: Sequence[Source]) -> list[str]:
+def view_names(runs: Sequence[RunFiles]) -> list[str]:
     """Photographs that were measured in every run that has measured any, from the lowest mean PSNR to the highest."""
     measured = [one for run in runs if (one := psnrs(run))]
     common = [name for name in measured[0] if all(name in one for one in measured)] if measured else []
     return sorted(common, key=lambda name: (sum(one[name] for one in measured), name))
 
 
-def psnrs(run: Source) -> dict[str, float]:
+def psnrs(run: RunFiles) -> dict[str, float]:
     """PSNR by photograph."""
     per_image = mapping(run.metrics, "images", "per_image")
     found = {name: number(per_image, name, "psnr") for name in per_image}
     return {name: value for name, value in found.items() if value is not None}
 
 
-def chosen(runs: Sequence[Source], names: Sequence[str], views: int) -> list[tuple[str, str]]:
+def chosen(runs: Sequence[RunFiles], names: Sequence[str], views: int) -> list[tuple[str, str]]:
     """So many of the names that have pictures, each with its rank in words: evenly from the worst to the best."""
     there = [name for name in names if any(panel_path(run, name) for run in runs)]
     count = min(views, len(there))
@@ -76,15 +76,15 @@ def chosen(runs: Sequence[Source], names: Sequence[str], views: int) -> list[tup
     return [(there[rank], words.get(rank, f"PSNR number {rank + 1} of {len(there)}")) for rank in ranks]
 
 
-def panel_path(run: Source, name: str) -> Path | None:
+def panel_path(run: RunFiles, name: str) -> Path | None:
     """The picture that the evaluation has written of a view, if it is there."""
     path = picture_path(run.out / "pictures", name)
     return path if path.is_file() else None
 
 
-def shown(runs: Sequence[Source], name: str, word: str) -> Group:
+def shown(runs: Sequence[RunFiles], name: str, word: str) -> ElementGroup:
     """A view: photograph and renders over each other, then depth and normals of each run."""
-    layers: dict[str, Picture] = {}
+    layers: dict[str, EmbeddedPicture] = {}
     maps: list[Element] = []
     for run in runs:
         value, has_one = psnrs(run).get(name), len(runs) == 1
@@ -100,12 +100,12 @@ def shown(runs: Sequence[Source], name: str, word: str) -> Group:
     if len(layers) > 1:
         elements.append(Compare(name, tuple(layers.items()), is_titled=False))
     if maps:
-        row = Row(tuple(maps), size="small")
-        elements.append(row if len(runs) <= MOST_OPEN else Details(f"Depth and normals of {name}", (row,)))
-    return Group(f"{name} ({word})", tuple(elements))
+        row = ElementRow(tuple(maps), size="small")
+        elements.append(row if len(runs) <= MAX_OPEN_RUNS else Details(f"Depth and normals of {name}", (row,)))
+    return ElementGroup(f"{name} ({word})", tuple(elements))
 
 
-def panel(run: Source, name: str) -> dict[str, Picture]:
+def panel(run: RunFiles, name: str) -> dict[str, EmbeddedPicture]:
     """The parts of the picture of a view; in one piece, as "pictures", where nobody knows how wide a part is."""
     path = panel_path(run, name)
     if path is None:
@@ -113,16 +113,16 @@ def panel(run: Source, name: str) -> dict[str, Picture]:
     width, height = image_size(path)
     size = run.photo_sizes.get(name)
     count = width // size[0] if size and size[0] else 0
-    if not (size and 1 < count <= len(PARTS) and (width, height) == (count * size[0], size[1])):
-        return {"pictures": Picture(path, f"photograph, render and maps of {name}")}
+    if not (size and 1 < count <= len(PICTURE_PARTS) and (width, height) == (count * size[0], size[1])):
+        return {"pictures": EmbeddedPicture(path, f"photograph, render and maps of {name}")}
     boxes = [(at * size[0], 0, (at + 1) * size[0], height) for at in range(count)]
     return {
-        part: Picture(path, f"{part} of {name}" + (f", {run.name}" if part != "photograph" else ""), box)
-        for part, box in zip(PARTS, boxes, strict=False)
+        part: EmbeddedPicture(path, f"{part} of {name}" + (f", {run.name}" if part != "photograph" else ""), box)
+        for part, box in zip(PICTURE_PARTS, boxes, strict=False)
     }
 
 
-def _table(runs: Sequence[Source], names: Sequence[str]) -> Table:
+def _table(runs: Sequence[RunFiles], names: Sequence[str]) -> TableElement:
     """PSNR and SSIM of every view that all runs have measured."""
     rows = []
     for name in names:
@@ -131,7 +131,7 @@ def _table(runs: Sequence[Source], names: Sequence[str]) -> Table:
             for key, digits in (("psnr", 2), ("ssim", 3)):
                 value = number(mapping(run.metrics, "images", "per_image"), name, key)
                 cells.append(numeric(value, "" if value is None else f"{value:.{digits}f}"))
-        rows.append((Cell(name), *cells))
+        rows.append((TableCell(name), *cells))
     of = [""] if len(runs) == 1 else [f" of {run.name}" for run in runs]
     head = ("photograph", *(f"{what}{one}" for one in of for what in ("PSNR, dB", "SSIM")))
-    return Table("Held-out views, from the lowest PSNR to the highest", head, tuple(rows), is_sortable=True)
+    return TableElement("Held-out views, from the lowest PSNR to the highest", head, tuple(rows), is_sortable=True)

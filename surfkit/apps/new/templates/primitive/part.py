@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from surfkit.plugin import (
-    Cloud,
+    SparsePoints,
     Column,
     Columns,
     Gaussian3D,
@@ -32,7 +32,7 @@ class NewPart(Primitive):
         del columns["quats"]
         return columns | {"scales": Column((1,), columns["scales"].rate, columns["scales"].activation)}
 
-    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+    def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
         """A ball for each point of the cloud."""
         return seeds(self.columns(), cloud)
 

@@ -1,5 +1,5 @@
 import torch
-from surfkit.plugin import Cloud
+from surfkit.plugin import SparsePoints
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart
@@ -10,7 +10,7 @@ def test_it_keeps_the_contract_of_its_kind():
 
 
 def test_its_splats_are_round():
-    cloud = Cloud(torch.rand(20, 3), torch.zeros(20, 3, dtype=torch.uint8))
+    cloud = SparsePoints(torch.rand(20, 3), torch.zeros(20, 3, dtype=torch.uint8))
     primitive = NewPart(sh_degree=0)
     splats = primitive.activate(primitive.init(cloud, torch.Generator().manual_seed(0)), 0)
     assert splats.scales.shape == (20, 3)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from surfkit.plugin import BadInput, Capture, Data, Reader, Shot, camera_of, leaving_out
+from surfkit.plugin import BadInput, RawDataset, Data, Reader, RawImage, camera_of, leaving_out
 
 TABLE = "new-part.csv"
 """A line for each photograph: its name, width and height in pixels, fx, fy, cx, cy, and the twelve numbers of the first
@@ -23,7 +23,7 @@ class NewPart(Reader):
         """See `Reader.recognises`."""
         return (root / TABLE).is_file()
 
-    def read(self, data: Data) -> Capture:
+    def read(self, data: Data) -> RawDataset:
         """See `Reader.read`."""
         shots = []
         for number, line in enumerate(_lines(data.path / TABLE), 1):
@@ -32,7 +32,7 @@ class NewPart(Reader):
         points = data.path / POINTS
         rows = [_numbers(f"{points}, line {at}", line, 6) for at, line in enumerate(_lines(points), 1)]
         table = np.array(rows).reshape(-1, 6)
-        return Capture(shots, table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
+        return RawDataset(shots, table[:, :3], table[:, 3:].clip(0, 255).astype(np.uint8))
 
 
 def _lines(path: Path) -> list[str]:
@@ -40,7 +40,7 @@ def _lines(path: Path) -> list[str]:
     return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
 
-def _shot(where: str, line: str, images: Path) -> Shot:
+def _shot(where: str, line: str, images: Path) -> RawImage:
     name, _, rest = line.partition(",")
     values = _numbers(where, rest, 18)
     if not (images / name).is_file():
@@ -48,7 +48,7 @@ def _shot(where: str, line: str, images: Path) -> Shot:
     pose = np.eye(4)
     pose[:3] = np.reshape(values[6:], (3, 4))
     camera = camera_of(where, "PINHOLE", (int(values[0]), int(values[1])), values[2:6])
-    return Shot(name, pose, camera, images / name)
+    return RawImage(name, pose, camera, images / name)
 
 
 def _numbers(where: str, text: str, count: int) -> list[float]:

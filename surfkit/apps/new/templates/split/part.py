@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from surfkit.plugin import BadInput, Capture, Split
+from surfkit.plugin import BadInput, RawDataset, Split
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,6 @@ class NewPart(Split):
         if self.every < 2 or not 0 <= self.first < self.every:
             raise BadInput(f"new-part.every {self.every}, first {self.first}: give 2 or more, and 0 to every - 1")
 
-    def held_out(self, capture: Capture) -> Collection[str]:
+    def held_out(self, capture: RawDataset) -> Collection[str]:
         """See `Split.held_out`."""
         return sorted(shot.name for shot in capture.shots)[self.first :: self.every]

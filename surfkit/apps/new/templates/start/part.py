@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from surfkit.plugin import BadInput, Cloud, Start, StartInput
+from surfkit.plugin import BadInput, SparsePoints, Start, StartInput
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class NewPart(Start):
         """See `Start.expected`."""
         return max(1, round(self.share * sparse)) if sparse else 0
 
-    def cloud(self, known: StartInput) -> Cloud:
+    def cloud(self, known: StartInput) -> SparsePoints:
         """See `Start.cloud`."""
         cloud = known.scene.cloud
         count = len(cloud.xyz)
