@@ -33,11 +33,11 @@ import sys, torch
 from dataclasses import replace
 from pathlib import Path
 from surfkit.runs.blocks.block import Record, load_blocks
-from surfkit.runs.blocks.schedule import extract_views
+from surfkit.runs.blocks.train_blocks import extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.runs.folder import Run
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.partition import CoarseModel, QuantileGrid
 from surfkit.partition.plan import Plan, blocks_of
 from surfkit.primitives.points import Points
@@ -48,7 +48,7 @@ from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
-from surfkit.train.views import Order
+from surfkit.train.view_order import Order
 from surfkit.runs.context import RunContext
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
@@ -81,8 +81,8 @@ from surfkit.io.datasets.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.state import StageState
-from surfkit.train.views import Order
-from surfkit.runs.stage import Intervals
+from surfkit.train.view_order import Order
+from surfkit.runs.run_stage import Intervals
 from surfkit.runs.blocks.worker import Start
 from surfkit.runs.context import RunContext
 import torch
@@ -159,11 +159,11 @@ def merge(out: Path) -> None:
     from surfkit.io.datasets import extract
     from surfkit.raster.select import select
     from surfkit.runs.blocks.block import load_blocks, read_plan
-    from surfkit.runs.blocks.merge import merge_blocks
+    from surfkit.runs.blocks.merge_blocks import merge_blocks
     from surfkit.runs.blocks.worker import open_coarse_model
     from surfkit.runs.context import RunContext
     from surfkit.runs.pipeline import opened
-    from surfkit.runs.stage import Intervals
+    from surfkit.runs.run_stage import Intervals
     from surfkit.train.data_cache import CacheSettings
 
     run = opened(out)

@@ -28,13 +28,13 @@ from surfkit.partition.plan import BlockMinimums, plan
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.runs.blocks.block import load_blocks
-from surfkit.runs.blocks.schedule import Compute, extract_views, load_or_make_plan, train_waiting
+from surfkit.runs.blocks.train_blocks import Compute, extract_views, load_or_make_plan, train_waiting
 from surfkit.runs.blocks.worker import open_coarse_model
 from surfkit.runs.context import RunContext
 from surfkit.runs.execute import Pool
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.data_cache import CacheSettings

@@ -25,17 +25,17 @@ from machine import save
 from view import SIZE, city
 from viser import transforms
 
-from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.page import first_view
-from surfkit.apps.view.screen import WORLD, ray_through
+from surfkit.apps.view.browser_camera import WORLD, ray_through
+from surfkit.apps.view.measure_clicks import coordinates
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import SharedCache
-from surfkit.apps.view.subject import ViewerPoints, ViewerScene
+from surfkit.apps.view.shared_cache import SharedCache
+from surfkit.apps.view.viewer_page import first_view
+from surfkit.apps.view.viewer_scene import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.select import select
-from surfkit.runs.method import with_drawing
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.run_method import with_drawing
 from surfkit.scene.scene import Frame
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -21,9 +21,9 @@ from surfkit.apps.doctor.forecast import ProbePlan, forecast
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.io.datasets.data import Data
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 
 
 def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:

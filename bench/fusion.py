@@ -22,13 +22,13 @@ from scipy.ndimage import gaussian_filter
 from surfkit.evaluate.geometry.comparison import Comparison, make_side, truth_side, volume
 from surfkit.evaluate.geometry.repetition import Measurement
 from surfkit.evaluate.geometry.scores import nearest, shares, tree
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh, MeshInput
 from surfkit.mesh.clean import clean
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.geometric_consistency import GeometricConsistency
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.stereo import points
 from surfkit.mesh.tsdf import TSDF

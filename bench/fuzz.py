@@ -40,7 +40,7 @@ def main() -> int:
     import torch.fx.experimental.symbolic_shapes  # noqa: F401  (slow ones, loaded once: processes are forked from here)
 
     from surfkit.cli.recipes import recipes
-    from surfkit.io.datasets.capture import load_pycolmap
+    from surfkit.io.datasets.raw_dataset import load_pycolmap
 
     recipes(), load_pycolmap()
     found: dict[tuple[str, str], Finding] = {}

@@ -27,10 +27,10 @@ from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.compress.cuda.codes import sums as gpu_sums
 from surfkit.compress.kmeans import nearest, sums
 from surfkit.depth.cuda.passes import GpuPasses
-from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve
-from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve
+from surfkit.mesh.cuda.gpu_grid import GpuGrid
 from surfkit.mesh.lattice import FusionImage, Lattice
-from surfkit.mesh.native import grid
+from surfkit.mesh.native_grid import grid
 from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import select
 from surfkit.raster.ssim import ssim

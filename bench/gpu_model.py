@@ -23,16 +23,16 @@ from machine import save
 from scenes import city
 
 from surfkit.compress.cuda import codes
-from surfkit.mesh.cuda import grid
-from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.mesh.cuda import gpu_grid as grid
+from surfkit.mesh.cuda.gpu_grid import GpuGrid
 from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.raster.api import Maps
-from surfkit.raster.cuda import ssim
+from surfkit.raster.cuda import cuda_ssim as ssim
 from surfkit.raster.cuda.rasterizer import TileRasterizer
 from surfkit.raster.cuda.rasterizer import source as raster_source
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.nvrtc.nvrtc import nvrtc, resources
-from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.scene.camera import Camera
 from surfkit.train import adam
 

@@ -29,11 +29,11 @@ from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from surfkit.apps.maps.contours import contour_lines, even_interval
-from surfkit.apps.maps.grid import MapGrid, Window
-from surfkit.apps.maps.ours import MAPS_RECORD
+from surfkit.apps.maps.map_grid import MapGrid, Window
+from surfkit.apps.maps.owned_files import MAPS_RECORD
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.evaluate.mesh.edges import boundary_edges
 from surfkit.evaluate.mesh.whole import whole_mesh
 from surfkit.runs.pipeline import opened

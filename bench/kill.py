@@ -97,7 +97,7 @@ def load_all() -> None:
     from PIL import Image
 
     from surfkit.cli.recipes import recipes
-    from surfkit.io.datasets.capture import load_pycolmap
+    from surfkit.io.datasets.raw_dataset import load_pycolmap
 
     recipes()
     load_pycolmap()

@@ -34,13 +34,13 @@ from surfkit.apps.view.server import Address
 from surfkit.cli.recipes import recipes
 from surfkit.io.datasets.data import Data
 from surfkit.primitives.points import Points
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import TrainingDisplay
 from surfkit.train.state import StageState
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 
 WAYS = ("no page", "nobody looks", "somebody looks")

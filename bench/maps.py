@@ -20,7 +20,7 @@ import rasterio
 import torch
 from scipy import ndimage
 
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.mesh.shade import draw_faces

@@ -61,7 +61,7 @@ def name(at: int) -> str:
 
 def main() -> int:
     """Run it."""
-    from surfkit.scene.memory import cache_bytes
+    from surfkit.scene.available_memory import cache_bytes
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for flag, default in {"images": 10_000, "width": 5472, "height": 3648, "points": 200_000, "steps": 60}.items():

@@ -22,9 +22,9 @@ import torch
 from machine import RESULTS, save
 
 from surfkit.mesh.base import MeshInput
+from surfkit.mesh.fusion_image import picture
 from surfkit.mesh.lattice import Lattice
-from surfkit.mesh.native import NativeGrid
-from surfkit.mesh.picture import picture
+from surfkit.mesh.native_grid import NativeGrid
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats

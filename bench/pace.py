@@ -24,9 +24,9 @@ from machine import save
 from playwright.sync_api import Page, sync_playwright
 from view import QUIET, RENDERER, SIZE, SOFTWARE, city
 
-from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import ViewerPoints, ViewerScene
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
 

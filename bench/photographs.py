@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher
-from surfkit.apps.sfm.prepare import SfmPreparation
 from surfkit.apps.sfm.settings import Settings
+from surfkit.apps.sfm.sfm_pipeline import SfmPreparation
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.core.registry import find
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm
-from surfkit.testing.exif import write_exif
+from surfkit.testing.write_exif import write_exif
 
 PLACE = np.array([512_000.0, 5_800_000.0, 100.0])
 """In zone 33 of UTM, from where the coordinates of the model are counted."""

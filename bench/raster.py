@@ -13,8 +13,8 @@ from machine import cpu_seconds, save
 from scenes import city
 
 from surfkit.raster.api import MAPS, Maps
-from surfkit.raster.compiled import NativeRasterizer, _Pass
 from surfkit.raster.native import module
+from surfkit.raster.native_rasterizer import NativeRasterizer, _Pass
 from surfkit.raster.ssim import ssim
 from surfkit.train.adam import update
 

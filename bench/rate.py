@@ -22,8 +22,8 @@ from torch import Tensor
 
 from surfkit.compress.base import Compressor
 from surfkit.compress.container import read_model, write_model
+from surfkit.compress.lossless import Float16
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Float16
 from surfkit.core.registry import find
 from surfkit.io.splats.base import Format
 from surfkit.primitives.drawing import drawn_by
@@ -31,8 +31,8 @@ from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.psnr import psnr
 from surfkit.runs.context import RunContext
-from surfkit.runs.method import splats_of
 from surfkit.runs.pipeline import loaded
+from surfkit.runs.run_method import splats_of
 from surfkit.scene.photos import view_photo
 
 FORMATS = ("ply", "compressed-ply", "splat", "spz", "sog")

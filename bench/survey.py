@@ -17,7 +17,7 @@ from trained import copied, halfway
 
 from surfkit.losses.base import Target
 from surfkit.study.recipes import SURFELS
-from surfkit.train.views import ViewContributions
+from surfkit.train.view_order import ViewContributions
 
 
 def taken(action: Callable[[], object]) -> float:

@@ -21,10 +21,10 @@ import trimesh
 from machine import save
 from PIL import Image
 
-from surfkit.apps.maps.photographs import between
-from surfkit.apps.texture.look import project
-from surfkit.apps.texture.make import local_mesh
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.apps.maps.orthophoto import between
+from surfkit.apps.texture.texture_mesh import local_mesh
+from surfkit.apps.texture.triangle_visibility import project
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.read import read
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces

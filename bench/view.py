@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from machine import save
 
-from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import DEFAULT_BUDGET, SPLAT_FORMS
-from surfkit.apps.view.subject import ViewerScene
+from surfkit.apps.view.shared_cache import DEFAULT_BUDGET, SPLAT_FORMS
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerScene
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.scene.scene import Frame
 
 SIZE = {"width": 1280, "height": 720}

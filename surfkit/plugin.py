@@ -10,7 +10,7 @@ from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, Fi
 from surfkit.compress.base import Compressor, Plan
 from surfkit.compress.encoding import ColumnType, Encoding
 from surfkit.compress.levels.base import LevelsOfDetail, LodInput
-from surfkit.compress.levels.tree import LodBlock, LodBlocks, LodTree
+from surfkit.compress.levels.lod_tree import LodBlock, LodBlocks, LodTree
 from surfkit.compress.octree import Leaf
 from surfkit.compress.streams import Stored
 from surfkit.core.check import BadInput, Fault, expect, leaving_out, reject, require_within
@@ -37,15 +37,15 @@ from surfkit.densify import ADC, AbsGradient, CountCap, MatchedADC
 from surfkit.densify.base import Contribution, Densify, Filter, Policy, Prune, Signal, Step, Views, admitted
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
 from surfkit.io.datasets.depth_prior import DepthPrior
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.split import Split
-from surfkit.io.splats.axes import FileAxes
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.file_axes import FileAxes
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses import (
     L1,
     SSIM,

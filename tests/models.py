@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from surfkit.io.splats.ply import write_splats
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 ORIGIN = (492000.0, 5260000.0, 430.0)

@@ -9,7 +9,7 @@ import torch
 from needs import needs
 from pages import ROOT
 
-from surfkit.apps.maps.grid import MapGrid
+from surfkit.apps.maps.map_grid import MapGrid
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame

@@ -21,7 +21,7 @@ from surfkit.io.splats.ply import read_splats
 from surfkit.losses.base import Loss
 from surfkit.mesh.base import Mesher
 from surfkit.primitives.base import Primitive
-from surfkit.runs import stage
+from surfkit.runs import run_stage as stage
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint

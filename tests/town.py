@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 from surfkit.testing.synthetic import Box, GroundPlane

@@ -12,10 +12,10 @@ import torch
 from surfkit.core.files import replacing
 from surfkit.io.datasets.data import Data
 from surfkit.partition import PictureShare, QuantileGrid
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.progress import TrainingDisplay
@@ -85,7 +85,7 @@ def stop_after(optimise, step):
 
     def stopping(job, state):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("surfkit.runs.stage.TrainingDisplay", Interrupting)
+            patch.setattr("surfkit.runs.run_stage.TrainingDisplay", Interrupting)
             return optimise(job, state)
 
     return stopping

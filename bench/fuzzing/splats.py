@@ -32,7 +32,7 @@ def write_model(folder: Path, name: str) -> Path:
     """A file of 600 splats."""
     from surfkit.core.registry import find
     from surfkit.io.splats.base import Format
-    from surfkit.testing.files import splat_table
+    from surfkit.testing.format_checks import splat_table
 
     form = find(Format, name.removesuffix("-4").removesuffix("-spz"))(**FORMATS[name])
     folder.mkdir(parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ class Target:
 def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     """A run that is finished, or stopped after the first step of a stage, such as "pretrain" or "block 1"."""
     from surfkit.cli import main
-    from surfkit.runs import stage
+    from surfkit.runs import run_stage as stage
 
     colmap(here)
     display = stage.TrainingDisplay

@@ -29,7 +29,7 @@ from programs import Missing  # noqa: E402
 from splats import Bounds, Splats, difference, precision, read_ply, representable  # noqa: E402
 
 from surfkit.core.check import BadInput  # noqa: E402
-from surfkit.io.splats.files import read_splat_file  # noqa: E402
+from surfkit.io.splats.splat_files import read_splat_file  # noqa: E402
 
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """What programs turn the content of a tile by: y up, as glTF has it, becomes z up."""

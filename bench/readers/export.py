@@ -8,7 +8,7 @@ from pathlib import Path
 
 from surfkit.core.registry import components
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.files import read_splat_file
+from surfkit.io.splats.splat_files import read_splat_file
 
 
 def variants() -> dict[str, Format]:

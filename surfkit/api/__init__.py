@@ -18,7 +18,7 @@ from surfkit.core.events import say
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs import pipeline
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.recipe import Recipe, complete
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage

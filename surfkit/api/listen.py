@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from surfkit.core.events import StepDone, Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 OnStep = Callable[[StepDone], None]
 """Called after each optimisation step. It may raise KeyboardInterrupt: the run saves its state and stops."""

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.mesh.base import VALUES
 from surfkit.mesh.base import Mesh as LocalMesh
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.scene.scene import Frame
 
 

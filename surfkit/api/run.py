@@ -18,30 +18,30 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import components, find, unknown
 from surfkit.core.tree import evolve
 from surfkit.evaluate.geometry.comparison import Comparison
-from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.measure_geometry import measure_geometry
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
 from surfkit.runs import pipeline
 from surfkit.runs.context import RunContext
+from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import note_metrics
 from surfkit.runs.journal import record_events
-from surfkit.runs.lod import load_levels
-from surfkit.runs.measure import evaluate
-from surfkit.runs.mesh import MeshOutput, make_mesh, mesh_input
-from surfkit.runs.method import refuse_mesher, refuse_not_drawn, splats_of
+from surfkit.runs.make_levels import load_levels
+from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.measure_run import evaluate
 from surfkit.runs.methods.base import Reconstruction
-from surfkit.runs.notes import collect_notes
-from surfkit.runs.prepare import with_maps_to_mesh
 from surfkit.runs.recipe import Recipe
+from surfkit.runs.run_method import refuse_mesher, refuse_not_drawn, splats_of
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.camera import Camera
-from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import View
-from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 def open_run(out: str | Path, *, device: Device = "auto") -> TrainedRun:

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from surfkit.apps.forecast import foretell
-from surfkit.cli.table import print_table
+from surfkit.apps.ablation_forecast import foretell
+from surfkit.cli.console_table import print_table
 from surfkit.cli.tables import chosen_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
@@ -20,13 +20,13 @@ from surfkit.io.datasets.data import ReadSettings
 from surfkit.raster.select import Device
 from surfkit.runs.execute.base import Executor, Inline
 from surfkit.study.ablation import Table
-from surfkit.study.notes import lines_on_depth, row_numbers
-from surfkit.study.others import OtherMesh
+from surfkit.study.ablation_screen import AblationScreen
+from surfkit.study.ablation_warnings import lines_on_depth, row_numbers
+from surfkit.study.foreign_meshes import OtherMesh
 from surfkit.study.rows import Trial
-from surfkit.study.screen import AblationScreen
-from surfkit.study.sharing import sharing_lines
+from surfkit.study.shared_stages import sharing_lines
 from surfkit.study.study import TABLE_WRITERS, AblationPlan, ablate, mesh_alone, report_so_far, trials
-from surfkit.study.table import LEGEND, STACKED, drawing, failures, lines
+from surfkit.study.table_text import LEGEND, STACKED, drawing, failures, lines
 from surfkit.study.truth import Truth
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_failures, print_table
+from surfkit.cli.console_table import print_failures, print_table
 from surfkit.core.check import BadInput
 from surfkit.core.describe import Kinds, by_kind, settings, summary
 from surfkit.core.registry import Component, kind_of, offered, records, unknown

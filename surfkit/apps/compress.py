@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from surfkit.apps.result import compressed_rows
+from surfkit.apps.run_summary import compressed_rows
+from surfkit.cli.console_table import print_table, tell
 from surfkit.cli.recipes import ARGV, part_of_run
-from surfkit.cli.table import print_table, tell
 from surfkit.compress.base import Compressor
 from surfkit.compress.format import model_of_file
 from surfkit.compress.packed import Packed
@@ -20,17 +20,17 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice, name_of
-from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.raster.select import Device
-from surfkit.runs.compress import CompressionTarget, compress_run, fitted, size_with, writing
+from surfkit.runs.compress_model import CompressionTarget, compress_run, fitted, size_with, writing
 from surfkit.runs.folder import Run
 from surfkit.runs.journal import record_events
-from surfkit.runs.measure import measure_compressed
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.measure_run import measure_compressed
 from surfkit.runs.pipeline import loaded
-from surfkit.scene.memory import cache_bytes
-from surfkit.train.bars import bars
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

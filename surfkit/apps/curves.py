@@ -8,10 +8,10 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_table, tell
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.chart import write_lines
-from surfkit.study.curves import StageRef, What, lines
+from surfkit.evaluate.geometry.line_plot import write_lines
+from surfkit.study.run_curves import StageRef, What, lines
 
 TITLES = {"points": "points", "loss": "sum of the weighted losses", "memory": "most memory held so far, GB"}
 

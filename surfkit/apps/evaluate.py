@@ -9,34 +9,34 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.result import quality_rows, show, show_geometry, show_levels
-from surfkit.cli.table import print_table, tell
+from surfkit.apps.run_summary import quality_rows, show, show_geometry, show_levels
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
-from surfkit.evaluate.geometry.measure import measure_geometry
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
-from surfkit.evaluate.mesh.measure import measure_mesh
+from surfkit.evaluate.geometry.measure_geometry import measure_geometry
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface
+from surfkit.evaluate.mesh.measure_mesh import measure_mesh
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device
 from surfkit.runs.command import refuse_no_mesh
 from surfkit.runs.context import RunContext
 from surfkit.runs.folder import Run, note_metrics, refuse_no_run
-from surfkit.runs.lod import load_levels, measure_levels
-from surfkit.runs.measure import evaluate, note_compressed
-from surfkit.runs.method import is_drawn, refuse_not_drawn, splats_of
+from surfkit.runs.make_levels import load_levels, measure_levels
+from surfkit.runs.measure_run import evaluate, note_compressed
 from surfkit.runs.methods.base import Reconstruction
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import loaded, opened
 from surfkit.runs.resume import read_unchanged
+from surfkit.runs.run_method import is_drawn, refuse_not_drawn, splats_of
+from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import NONE_HELD_OUT
 from surfkit.scene.scene import Scene
-from surfkit.study.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
-from surfkit.train.bars import bars
+from surfkit.study.photo_zones import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

@@ -12,26 +12,26 @@ import numpy as np
 import tyro
 
 from surfkit.apps.render.path import up_of
+from surfkit.cli.console_table import tell
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
 from surfkit.core.memory import size
 from surfkit.core.registry import choice, name_of
-from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.files import format_for, format_of, has_suffix, read_splat_file
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.page import HtmlPageFormat
 from surfkit.io.splats.ply import PLY
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_files import format_for, format_of, has_suffix, read_splat_file
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.tiles3d import Tiles3D
 from surfkit.primitives.model import SplatModel
 from surfkit.runs.folder import Run, refuse_no_run
-from surfkit.runs.lod import load_levels
-from surfkit.runs.method import splats_of
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.make_levels import load_levels
 from surfkit.runs.pipeline import loaded
+from surfkit.runs.run_method import splats_of
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.scene import Frame, Scene
 from surfkit.train.faults import full_disk_in_one_line
 

@@ -8,15 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.apps.result import show
+from surfkit.apps.run_summary import show
 from surfkit.core.registry import choice
 from surfkit.io.datasets.data import ReadSettings
-from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.select import Device
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.methods.imported import SplatImport
 from surfkit.runs.pipeline import run

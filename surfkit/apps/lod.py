@@ -9,23 +9,23 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.result import lod_rows
+from surfkit.apps.run_summary import lod_rows
+from surfkit.cli.console_table import print_table
 from surfkit.cli.recipes import part_of_run
-from surfkit.cli.table import print_table
 from surfkit.compress.levels.base import LevelsOfDetail
-from surfkit.compress.levels.merge import MergedLevels
+from surfkit.compress.levels.merged_levels import MergedLevels
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.raster.select import Device
 from surfkit.runs.folder import Run
 from surfkit.runs.journal import record_events
-from surfkit.runs.lod import make_levels
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.make_levels import make_levels
 from surfkit.runs.pipeline import loaded
-from surfkit.scene.memory import cache_bytes
-from surfkit.train.bars import bars
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

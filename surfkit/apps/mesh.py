@@ -10,27 +10,27 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.result import mesh_rows
+from surfkit.apps.run_summary import mesh_rows
+from surfkit.cli.console_table import print_table
 from surfkit.cli.recipes import ARGV, part_of_run
-from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.select import Device
+from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import Run
 from surfkit.runs.journal import record_events
-from surfkit.runs.mesh import MeshOutput, make_mesh, mesh_input
-from surfkit.runs.method import refuse_mesher
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
 from surfkit.runs.pipeline import loaded
-from surfkit.runs.prepare import with_maps_to_mesh
+from surfkit.runs.run_method import refuse_mesher
+from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import note_held_out
-from surfkit.scene.memory import cache_bytes
-from surfkit.train.bars import bars
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from surfkit.cli.table import print_table
+from surfkit.cli.console_table import print_table
 from surfkit.core.registry import Plugin, offered, records
 
 

@@ -12,7 +12,7 @@ import torch
 import tyro
 from rich.console import Console
 
-from surfkit.cli.table import print_table, tell
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput, printable
 from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import sweep
@@ -20,17 +20,17 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.depth.prepare import WITHOUT_DEPTH, DepthPreparation, EstimatedPhoto
-from surfkit.evaluate.images.pictures import colour_depth, write_picture
+from surfkit.depth.prepare_depth_maps import WITHOUT_DEPTH, DepthPreparation, EstimatedPhoto
+from surfkit.evaluate.images.comparison_pictures import colour_depth, write_picture
 from surfkit.io.datasets.data import ReadSettings
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, DepthFile, map_path
 from surfkit.io.datasets.depth_prior import trust_warning
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device, torch_device
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
-from surfkit.train.bars import bars
+from surfkit.train.progress_bars import bars
 
 OVERVIEW = "overview.png"
 OVERVIEW_VIEWS = 4

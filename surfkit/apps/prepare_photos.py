@@ -12,10 +12,10 @@ import torch
 import tyro
 
 from surfkit.apps.prepare_depth import OVERVIEW, PrepareDepthCommand
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.prepare import CAMERAS_PICTURE, SfmPreparation
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
-from surfkit.cli.table import print_table, tell
+from surfkit.apps.sfm.sfm_pipeline import CAMERAS_PICTURE, SfmPreparation
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import Warned, emit
@@ -24,17 +24,17 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.core.stages import StageFolder, key_of
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare import DepthPreparation as DepthMaps
+from surfkit.depth.prepare_depth_maps import DepthPreparation as DepthMaps
 from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, read_record
 from surfkit.io.datasets.depth_prior import trust_warning
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device, torch_device
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.camera import Camera
-from surfkit.scene.names import VIDEO_SUFFIXES, is_video
+from surfkit.scene.photo_names import VIDEO_SUFFIXES, is_video
 from surfkit.scene.scene import View
-from surfkit.train.bars import bars
+from surfkit.train.progress_bars import bars
 
 LISTED_PHOTOS = 10
 """Photographs without a camera that are listed."""

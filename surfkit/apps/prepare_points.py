@@ -14,7 +14,7 @@ from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher
 from surfkit.apps.sfm.settings import WORK_FOLDER, Settings
 from surfkit.apps.sfm.sift import SIFT, PyCOLMAP
 from surfkit.apps.sfm.tie_points import TiePoints
-from surfkit.cli.table import print_table, tell
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
@@ -22,9 +22,9 @@ from surfkit.core.registry import choice
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import reader_of
 from surfkit.raster.select import Device, torch_device
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.pixels import Alpha
-from surfkit.train.bars import bars
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from surfkit.cli.console_table import print_failures, print_table
 from surfkit.cli.recipes import about, recipes
-from surfkit.cli.table import print_failures, print_table
 
 
 @dataclass(frozen=True)

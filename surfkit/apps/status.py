@@ -10,11 +10,11 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_table, tell
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.runs.blocks.eta import seconds_elapsed, seconds_left
-from surfkit.runs.status import BlockStatus, Status, as_json, status
+from surfkit.runs.run_status import BlockStatus, Status, as_json, status
 
 UNFINISHED_STATUS = 3
 MAX_SILENT_S = 60.0

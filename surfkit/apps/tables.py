@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_failures, print_table
+from surfkit.cli.console_table import print_failures, print_table
 from surfkit.cli.tables import TABLE_PREFIX, tables
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump

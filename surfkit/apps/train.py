@@ -12,24 +12,24 @@ from typing import Annotated
 import tyro
 
 import surfkit
-from surfkit.apps.doctor.usual_steps import with_usual_steps
+from surfkit.apps.doctor.default_steps import with_usual_steps
 from surfkit.apps.prepare_photos import as_before
-from surfkit.apps.result import show, what_next
+from surfkit.apps.run_summary import show, what_next
 from surfkit.apps.view.server import LOCAL, Address, refuse_wrong_port
+from surfkit.cli.console_table import tell
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
-from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.registry import choice
 from surfkit.io.datasets.data import ReadSettings
 from surfkit.io.datasets.read import bare_photographs
 from surfkit.raster.select import Device
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute.base import Executor, Inline
 from surfkit.runs.folder import Run, read_data
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.runs.recipe import Recipe, unused
-from surfkit.runs.stage import CHECKPOINT_EVERY, Intervals
+from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals
 from surfkit.study.tensorboard import tensorboard
 from surfkit.train.data_cache import CacheSettings
 

@@ -16,13 +16,13 @@ from surfkit.runs.blocks.block import BlockRun, plan_file, read_plan
 from surfkit.runs.blocks.worker import train_block
 from surfkit.runs.command import train_command
 from surfkit.runs.context import RunContext
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import opened
-from surfkit.runs.stage import CHECKPOINT_EVERY, Intervals, select_rasterizer
+from surfkit.runs.run_notes import collect_notes
+from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals, select_rasterizer
 from surfkit.study.tensorboard import tensorboard
-from surfkit.train.bars import bars
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
 from surfkit.cli.help_cache import HELP_FLAGS, keep, kept_help, show_kept
-from surfkit.cli.streams import (
+from surfkit.cli.standard_streams import (
     READER_LEFT,
     outlive_terminal,
     recorded,

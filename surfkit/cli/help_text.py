@@ -22,7 +22,7 @@ from tyro.constructors import (
     UnsupportedTypeAnnotationError,
 )
 
-from surfkit.cli.streams import recorded
+from surfkit.cli.standard_streams import recorded
 
 NONE_OF_TYRO = "None"
 """The word on a command line that tyro takes for no value."""

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from surfkit.cli.component_overrides import with_parts
 from surfkit.cli.help_cache import HELP_FLAGS
-from surfkit.cli.parts import with_parts
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.registry import offered_once

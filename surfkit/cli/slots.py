@@ -10,7 +10,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
 
-from surfkit.cli.parts import open_places, with_parts
+from surfkit.cli.component_overrides import open_places, with_parts
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
 from surfkit.core.hints import hints_of

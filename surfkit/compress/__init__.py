@@ -8,8 +8,8 @@ def surfkit_components():
     """Names of what this folder offers."""
     from surfkit.compress.colors import Codes, PrincipalComponents
     from surfkit.compress.format import SurfkitFile
+    from surfkit.compress.lossless import Float16, Lossless
     from surfkit.compress.packed import Packed
-    from surfkit.compress.plain import Float16, Lossless
     from surfkit.compress.scalars import Floats, LogSteps, MortonPositions, SmallestThree, UniformLevels
     from surfkit.compress.vectree import Vectree
 

@@ -12,10 +12,10 @@ import torch
 from surfkit.compress.container import ModelFile, write_model
 from surfkit.compress.index import CONTAINER_MAGIC
 from surfkit.compress.packed import Packed
-from surfkit.io.splats.axes import AxesOrAuto
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.files import format_of, read_splat_file
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.file_axes import AxesOrAuto
+from surfkit.io.splats.splat_files import format_of, read_splat_file
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.scene.scene import Frame
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from surfkit.compress.base import Compressor, Plan, kinds_of
 from surfkit.compress.colors import SH_COLUMNS, PrincipalComponents, principal_components, vectors
 from surfkit.compress.encoding import ColumnType, Encoding
-from surfkit.compress.plain import exact
+from surfkit.compress.lossless import exact
 from surfkit.compress.scalars import LogSteps, MortonPositions, SmallestThree, UniformLevels
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import EXP

@@ -6,8 +6,8 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap, Elongation
-from surfkit.densify.limited import PointCap
 from surfkit.densify.matched import MatchedADC
+from surfkit.densify.point_cap import PointCap
 from surfkit.densify.prune import PruneByImportance, PruneByOpacity
 from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.densify.trim import Trim

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from surfkit.depth.matching import ray_map, way_numbers
+from surfkit.depth.cost_volume import ray_map, way_numbers
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 

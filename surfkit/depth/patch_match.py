@@ -18,9 +18,9 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
+from surfkit.depth.cost_volume import ray_map
 from surfkit.depth.cuda.passes import GpuPasses
-from surfkit.depth.matching import ray_map
-from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve, require_native
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
 from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window

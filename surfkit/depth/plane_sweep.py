@@ -16,12 +16,12 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.memory import size
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
-from surfkit.depth.matching import PosedImage, cost_volume, ray_map
+from surfkit.depth.cost_volume import PosedImage, cost_volume, ray_map
 from surfkit.depth.neighbours import MAX_CANDIDATE_VIEWS, depth_range, neighbours
-from surfkit.depth.scanlines import best_planes, smooth_costs
+from surfkit.depth.semi_global_matching import best_planes, smooth_costs
 from surfkit.io.datasets.depth_files import save_array
+from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.camera import Camera
-from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
-from surfkit.mesh.agreement import GeometricConsistency
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tetra import Tetra

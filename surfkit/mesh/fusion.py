@@ -17,8 +17,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import FILE_PREFIX, remove
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.mesh.cuda.gpu_grid import GpuGrid
 from surfkit.mesh.floaters import drop_floaters
+from surfkit.mesh.fusion_image import weighed
+from surfkit.mesh.grid_tiles import BlockRange, join
 from surfkit.mesh.lattice import (
     BLOCK_SIDE_VOXELS,
     MAX_BLOCKS_FROM_ORIGIN,
@@ -28,10 +30,8 @@ from surfkit.mesh.lattice import (
     SurfacePatch,
     TsdfGrid,
 )
-from surfkit.mesh.native import grid
+from surfkit.mesh.native_grid import grid
 from surfkit.mesh.overlap import Depths
-from surfkit.mesh.picture import weighed
-from surfkit.mesh.tiles import BlockRange, join
 from surfkit.scene.arrays import write_array
 from surfkit.scene.camera import Camera
 

@@ -10,9 +10,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.mesh.cubes import CUBE_EDGES, triangles
 from surfkit.mesh.fusion import used
+from surfkit.mesh.grid_tiles import join
 from surfkit.mesh.lattice import SurfacePatch
-from surfkit.mesh.reference import name_edges
-from surfkit.mesh.tiles import join
+from surfkit.mesh.reference_grid import name_edges
 
 TILE_CELLS = 48
 """Cells along a tile."""

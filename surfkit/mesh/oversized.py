@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
-from surfkit.mesh.lengths import look
-from surfkit.mesh.picture import Which
+from surfkit.mesh.fusion_image import Which
+from surfkit.mesh.fusion_lengths import look
 
 
 def without_oversized(subject: MeshInput, largest_px: float, which: Which) -> MeshInput:

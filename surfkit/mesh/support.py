@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from surfkit.mesh.adjust import beside
-from surfkit.mesh.sights import ViewObservations, boxes_of, for_all
+from surfkit.mesh.refine_vertices import beside
+from surfkit.mesh.view_observations import ViewObservations, boxes_of, for_all
 from surfkit.raster.native import module
 
 

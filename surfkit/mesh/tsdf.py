@@ -13,15 +13,23 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.cuda import grid as gpu
+from surfkit.mesh.cuda import gpu_grid as gpu
 from surfkit.mesh.fusion import FusionTask, fuse
+from surfkit.mesh.fusion_image import Which, depth_of, picture, weighed
+from surfkit.mesh.fusion_lengths import MIN_TRUNCATION_VOXELS, Lengths, resolve, with_unit, without_hidden
+from surfkit.mesh.grid_tiles import (
+    BLOCK_TRIANGLES,
+    GRID_BUDGET_SHARE,
+    GRID_BYTES,
+    MESH_BYTES,
+    GridEstimate,
+    estimate,
+    plan,
+)
 from surfkit.mesh.lattice import BLOCK_SIDE_VOXELS, FULL_WEIGHT, MAX_BLOCKS_FROM_ORIGIN, FusionImage, Lattice
-from surfkit.mesh.lengths import MIN_TRUNCATION_VOXELS, Lengths, resolve, with_unit, without_hidden
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
-from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.sky import may_show_sky, without_sky
-from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BUDGET_SHARE, GRID_BYTES, MESH_BYTES, GridEstimate, estimate, plan
 from surfkit.mesh.trust import Trust
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View

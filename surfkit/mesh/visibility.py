@@ -18,23 +18,23 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
-from surfkit.mesh.adjust import adjusted
-from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.cut_tiles import LAST, UNDECIDED, DecidedTetrahedra, TetraTile, tiles
 from surfkit.mesh.delaunay import Tetrahedra, tetrahedralised
+from surfkit.mesh.fusion_image import Which
+from surfkit.mesh.fusion_lengths import look, with_unit
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.holes import close_holes
-from surfkit.mesh.lengths import look, with_unit
 from surfkit.mesh.manifold import apart, separated
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
-from surfkit.mesh.picture import Which
-from surfkit.mesh.places import SHELL_DEPTH, places_of
-from surfkit.mesh.points import SurfacePoints, gather
-from surfkit.mesh.sights import ObservationSettings, ViewObservations, boxes_of, for_all, seen
+from surfkit.mesh.refine_vertices import adjusted
 from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.support import supported
+from surfkit.mesh.surface_points import SurfacePoints, gather
 from surfkit.mesh.trust import Trust
+from surfkit.mesh.view_observations import ObservationSettings, ViewObservations, boxes_of, for_all, seen
+from surfkit.mesh.vote_points import SHELL_DEPTH, places_of
 from surfkit.raster.native import lacking, module
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View

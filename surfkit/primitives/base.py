@@ -12,7 +12,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component, kebab
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.columns import SIGMOID, Activation, Column
 from surfkit.primitives.points import Columns
 from surfkit.primitives.raw import cloud_of, raw_columns

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from torch import Tensor
 
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.points import Columns

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.columns import EXP, RATES, SIGMOID, Column
 from surfkit.primitives.init import SH_C0
 from surfkit.primitives.points import Columns

@@ -9,8 +9,8 @@ from surfkit.core.registry import Component
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Rasterizers, by name."""
-    from surfkit.raster.compiled import NativeRasterizer
     from surfkit.raster.cuda.gpu import CudaRasterizer
+    from surfkit.raster.native_rasterizer import NativeRasterizer
     from surfkit.raster.reference import Reference
 
     return {"native": NativeRasterizer, "reference": Reference, "nvidia": CudaRasterizer}

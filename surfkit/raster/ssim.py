@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from surfkit.raster import native
-from surfkit.raster.cuda import ssim as gpu
+from surfkit.raster.cuda import cuda_ssim as gpu
 
 C1, C2 = 0.01**2, 0.03**2
 WINDOW_RADIUS_PX, WINDOW_SIGMA_PX = 5, 1.5

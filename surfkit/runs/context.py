@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from surfkit.raster.api import Rasterizer
 from surfkit.runs.folder import Run
-from surfkit.runs.shared import RunCache
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_cache import RunCache
+from surfkit.runs.run_stage import Intervals
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import CacheSettings
 

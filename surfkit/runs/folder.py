@@ -23,7 +23,7 @@ from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
 
 SHARED = "shared.json"
-"""What a run shares with others, see `surfkit.runs.shared`."""
+"""What a run shares with others, see `surfkit.runs.run_cache`."""
 RUN_FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
 """In a run folder."""
 RUN_FOLDERS = (

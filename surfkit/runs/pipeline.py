@@ -23,10 +23,11 @@ from surfkit.io.splats.ply import write_splats
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.select import Device
 from surfkit.runs.blocks.block import plan_file
-from surfkit.runs.blocks.schedule import Compute, tune_blocks
+from surfkit.runs.blocks.train_blocks import Compute, tune_blocks
 from surfkit.runs.command import train_command
-from surfkit.runs.compress import decompressed, has_compressed, make_wanted_compressed
+from surfkit.runs.compress_model import decompressed, has_compressed, make_wanted_compressed
 from surfkit.runs.context import RunContext
+from surfkit.runs.ensure_depth_maps import with_maps, with_maps_to_mesh
 from surfkit.runs.folder import (
     Run,
     discard_results,
@@ -37,10 +38,14 @@ from surfkit.runs.folder import (
     refuse_no_run,
 )
 from surfkit.runs.journal import record_events
-from surfkit.runs.lod import has_levels, make_wanted_levels
-from surfkit.runs.measure import evaluate, measure_compressed
-from surfkit.runs.mesh import MeshOutput, has_mesh, make_mesh, mesh_input
-from surfkit.runs.method import (
+from surfkit.runs.make_levels import has_levels, make_wanted_levels
+from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
+from surfkit.runs.measure_run import evaluate, measure_compressed
+from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.recipe import Recipe, complete, refuse_unused
+from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
+from surfkit.runs.run_cache import RunCache
+from surfkit.runs.run_method import (
     is_begun,
     method_input,
     optimised,
@@ -49,23 +54,18 @@ from surfkit.runs.method import (
     result_path,
     with_drawing,
 )
-from surfkit.runs.methods.base import Reconstruction
-from surfkit.runs.notes import collect_notes, prefix_notes
-from surfkit.runs.prepare import with_maps, with_maps_to_mesh
-from surfkit.runs.recipe import Recipe, complete, refuse_unused
-from surfkit.runs.refine import refine_model, stage_scene
-from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
-from surfkit.runs.shared import RunCache
-from surfkit.runs.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
+from surfkit.runs.run_notes import collect_notes, prefix_notes
+from surfkit.runs.run_refinements import refine_model, stage_scene
+from surfkit.runs.run_stage import Intervals, StageJob, load_state, optimise, select_rasterizer
+from surfkit.runs.stage_cache import StageCache
 from surfkit.runs.start import InitialPointBuilder, align_priors
-from surfkit.runs.store import StageCache
 from surfkit.runs.warn import warn_of_gaps, warn_of_no_edits
-from surfkit.scene.memory import cache_bytes
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.scene import Scene
-from surfkit.train.bars import bars
 from surfkit.train.data_cache import CacheSettings, read_ahead
 from surfkit.train.faults import in_one_line
 from surfkit.train.memory_meter import MemoryMeter
+from surfkit.train.progress_bars import bars
 from surfkit.train.stage import MAX_STAGE_STEPS
 from surfkit.train.state import StageState
 

@@ -24,9 +24,9 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.methods.base import Method
-from surfkit.runs.methods.splats import SplatOptimisation
+from surfkit.runs.methods.splat_optimisation import SplatOptimisation
 from surfkit.start.base import Start
-from surfkit.start.plain import SparseStart
+from surfkit.start.simple_starts import SparseStart
 from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
 

@@ -19,13 +19,13 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import offered_once, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
+from surfkit.io.datasets.depth_map_index import is_there, located, read_made
 from surfkit.io.datasets.depth_prior import prior_files
 from surfkit.io.datasets.fingerprint import Fingerprint, changed, changed_file, fingerprint
-from surfkit.io.datasets.made_maps import is_there, located, read_made
 from surfkit.io.datasets.read import read
 from surfkit.runs.folder import Run, read_data, read_record
-from surfkit.runs.notes import RunNotes
 from surfkit.runs.recipe import Recipe
+from surfkit.runs.run_notes import RunNotes
 from surfkit.scene.scene import Frame, Scene
 
 PUT_BACK = "put them back"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.events import Warned, emit
-from surfkit.scene.large import open_image
+from surfkit.scene.large_photos import open_image
 
 EOI_MARKER = b"\xff\xd9"
 """The marker EOI, which ends a JPEG file."""

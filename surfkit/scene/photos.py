@@ -16,11 +16,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
+from surfkit.scene.byte_semaphore import ByteSemaphore
 from surfkit.scene.cache import Cache
-from surfkit.scene.copies import DecodedPhotoCache
-from surfkit.scene.gate import ByteSemaphore
+from surfkit.scene.decoded_photos import DecodedPhotoCache
 from surfkit.scene.jpeg import tell, with_end
-from surfkit.scene.large import (
+from surfkit.scene.large_photos import (
     DECODED_PIXEL_BYTES,
     GREY16_PIXEL_BYTES,
     OPACITY_PIXEL_BYTES,
@@ -30,14 +30,14 @@ from surfkit.scene.large import (
     open_image,
     refuse_too_large,
 )
-from surfkit.scene.names import HEIF_SUFFIXES
+from surfkit.scene.photo_names import HEIF_SUFFIXES
 from surfkit.scene.pixels import DEFAULT_PIXELS, ORIENTATION_TAG, Pixels, kind_of, to_rgb
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
 WIDTH_TAG, HEIGHT_TAG = 0x0100, 0x0101
 """Tags of TIFF: the size as stored."""
-# Whether a photograph is too large, `surfkit.scene.large` says.
+# Whether a photograph is too large, `surfkit.scene.large_photos` says.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 CACHE_VERSION = "1"
 """Changes when the same photograph would be read otherwise: copies on disk are then made again."""

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.scene.large import open_image
+from surfkit.scene.large_photos import open_image
 
 Alpha = Literal["mask", "blend", "ignore"]
 BITS_TAG, WHITE_LEVEL_TAG, MAX_SAMPLE_TAG, SAMPLES_TAG, EXTRA_SAMPLES_TAG = 258, 50717, 281, 277, 338

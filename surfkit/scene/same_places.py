@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.scene.sets import is_among
+from surfkit.scene.set_membership import is_among
 
 HASH = np.uint64(0x9E3779B97F4A7C15)
 """An odd number whose product scatters the bits of a coordinate."""

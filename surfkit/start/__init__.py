@@ -1,9 +1,9 @@
 """Initial points of the optimisation, by registered name."""
 
 from surfkit.core.hooks import hookimpl
-from surfkit.start.plain import RandomStart, SparseStart
-from surfkit.start.splats import SplatStart
-from surfkit.start.stereo import StereoStart
+from surfkit.start.simple_starts import RandomStart, SparseStart
+from surfkit.start.splat_start import SplatStart
+from surfkit.start.stereo_start import StereoStart
 
 
 @hookimpl

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from surfkit.scene.sets import is_among
+from surfkit.scene.set_membership import is_among
 
 VOXEL_INDEX_BITS = 19
 """Bits of the index of a voxel along each axis."""

@@ -13,7 +13,7 @@ from surfkit.core.schedule import rescale
 from surfkit.core.tree import evolve
 from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe, unused, without_unused
-from surfkit.study.columns import TABLE_COLUMNS
+from surfkit.study.metric_columns import TABLE_COLUMNS
 
 BASELINE = "Without splats"
 """Group of the rows that come last in a table, below those that packages add to it."""
@@ -27,7 +27,8 @@ class Row:
         label: Its name in the table.
         change: New values, by dotted path into the recipe.
         kept: Later rows build on this one; False for a change that was tried and given up.
-        paper: What was published for it, by the names of `surfkit.study.columns`: seconds, bytes and counts as such.
+        paper: What was published for it, by the names of `surfkit.study.metric_columns`: seconds, bytes and counts as
+        such.
         recipe: What is changed; None for that of the row it builds on.
         on: Label of the row above that it builds on, and that it is compared with; None for the last kept one.
         group: Heading of the part of the table that begins with it; "" goes on with the part above. The best values are

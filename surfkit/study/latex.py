@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from surfkit.study.columns import TABLE_COLUMNS
-from surfkit.study.table import (
+from surfkit.study.metric_columns import TABLE_COLUMNS
+from surfkit.study.table_text import (
     FormattedNumber,
     blanks,
     caption,
@@ -17,7 +17,7 @@ from surfkit.study.table import (
     measured_cells,
     published_columns,
 )
-from surfkit.study.table import published_cells as published
+from surfkit.study.table_text import published_cells as published
 
 PREAMBLE_NOTE = r"% In the preamble: \usepackage{adjustbox,booktabs} and \usepackage[table]{xcolor}"
 GREEK = """

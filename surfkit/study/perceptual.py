@@ -10,11 +10,11 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.evaluate.images.lpips import MIN_SIDE_PX, NoWeights, load_perceptual
-from surfkit.evaluate.images.measure import lpips_names, lpips_values
+from surfkit.evaluate.images.measure_images import lpips_names, lpips_values
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.raster.select import Device
 from surfkit.runs.folder import note_metrics
-from surfkit.runs.measure import note_compressed
+from surfkit.runs.measure_run import note_compressed
 from surfkit.runs.pipeline import loaded, opened
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import View

@@ -22,14 +22,14 @@ from surfkit.core.signals import terminable
 from surfkit.io.datasets.data import Data
 from surfkit.raster.select import Device
 from surfkit.runs import pipeline
-from surfkit.runs.blocks.schedule import WORKER_EXIT_S, Compute
+from surfkit.runs.blocks.train_blocks import WORKER_EXIT_S, Compute
 from surfkit.runs.execute.base import LOG, Executor, Job, JobResult
 from surfkit.runs.execute.remote import CHILD_POLL_S, DRIVER, INTERRUPTED_STATUS
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.store import StageCache
-from surfkit.study.compare import figures
+from surfkit.runs.run_notes import collect_notes
+from surfkit.runs.stage_cache import StageCache
 from surfkit.study.perceptual import measure_lpips
+from surfkit.study.row_comparison import figures
 from surfkit.study.truth import Truth
 from surfkit.train.data_cache import CacheSettings
 

@@ -7,8 +7,8 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
-from surfkit.study.columns import TABLE_COLUMNS
-from surfkit.study.table import data_name, data_sets
+from surfkit.study.metric_columns import TABLE_COLUMNS
+from surfkit.study.table_text import data_name, data_sets
 
 CSV_HEADER = (
     "table",

@@ -24,20 +24,20 @@ from surfkit.runs.execute.base import Executor, Inline
 from surfkit.runs.folder import Run, read_record
 from surfkit.runs.recipe import Recipe, complete
 from surfkit.runs.resume import compared_data
-from surfkit.runs.shared import versions
-from surfkit.runs.stage import select_rasterizer
-from surfkit.runs.store import StageCache
+from surfkit.runs.run_cache import versions
+from surfkit.runs.run_stage import select_rasterizer
+from surfkit.runs.stage_cache import StageCache
 from surfkit.study.ablation import Table, build, limit_points, pick, scaled
-from surfkit.study.columns import refuse_unknown_columns
-from surfkit.study.compare import compare
+from surfkit.study.ablation_warnings import lacked_maps, notes_of
+from surfkit.study.foreign_meshes import OtherMesh, measured_mesh, mesh_rows, refuse_unfit
 from surfkit.study.latex import latex
-from surfkit.study.notes import lacked_maps, notes_of
-from surfkit.study.others import OtherMesh, measured_mesh, mesh_rows, refuse_unfit
+from surfkit.study.metric_columns import refuse_unknown_columns
 from surfkit.study.perceptual import refuse_unmeasurable
+from surfkit.study.row_comparison import compare
 from surfkit.study.rows import Trial, TrialJob, TrialResult, attempt, finished, run_elsewhere
 from surfkit.study.runs_csv import comma_separated
-from surfkit.study.sharing import finished_keys, next_wave, shared_stages
-from surfkit.study.table import markdown
+from surfkit.study.shared_stages import finished_keys, next_wave, shared_stages
+from surfkit.study.table_text import markdown
 from surfkit.study.truth import Truth
 
 TABLE_WRITERS = {"md": markdown, "tex": latex, "csv": comma_separated}

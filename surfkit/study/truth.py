@@ -11,11 +11,11 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.evaluate.geometry.comparison import Comparison, truth_side
-from surfkit.evaluate.geometry.measure import measure_geometry
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.measure_geometry import measure_geometry
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.raster.select import Device
 from surfkit.runs.folder import Run, note_metrics
-from surfkit.runs.measure import note_compressed
+from surfkit.runs.measure_run import note_compressed
 from surfkit.runs.pipeline import loaded, mesh, opened
 from surfkit.runs.resume import read_unchanged
 from surfkit.scene.scene import Scene

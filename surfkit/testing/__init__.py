@@ -4,16 +4,16 @@
 of the part's kind. A part that breaks it raises AssertionError with a sentence that says what is wrong.
 """
 
-from surfkit.testing.compress import check_compressor, check_encoding
+from surfkit.testing.component_checks import check, check_component
+from surfkit.testing.compressor_checks import check_compressor, check_encoding
 from surfkit.testing.data_sets import check_depth_layout, check_split
 from surfkit.testing.executors import check_executor
-from surfkit.testing.features import check_feature_extractor, check_feature_matcher
-from surfkit.testing.files import check_format
+from surfkit.testing.feature_checks import check_feature_extractor, check_feature_matcher
+from surfkit.testing.format_checks import check_format
+from surfkit.testing.image_part_checks import check_appearance, check_depth_estimator, check_loss, check_regularizer
 from surfkit.testing.levels import check_levels_of_detail
-from surfkit.testing.method import check_method
-from surfkit.testing.parts import check, check_component
-from surfkit.testing.pictures import check_appearance, check_depth_estimator, check_loss, check_regularizer
-from surfkit.testing.points import (
+from surfkit.testing.method_checks import check_method
+from surfkit.testing.policy_checks import (
     check_densify,
     check_filter,
     check_policy,

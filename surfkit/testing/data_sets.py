@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
+from surfkit.io.datasets.raw_dataset import RawDataset
 from surfkit.io.datasets.read import read_capture, reader_of
 from surfkit.io.datasets.split import Split
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.compress.levels.base import LevelsOfDetail, LodInput
-from surfkit.compress.levels.sound import fault
-from surfkit.compress.levels.tree import LodTree
-from surfkit.testing.compare import assert_same, unchanged
+from surfkit.compress.levels.lod_tree import LodTree
+from surfkit.compress.levels.validate_levels import fault
+from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import lod_input
 
 

@@ -12,7 +12,7 @@ from surfkit.primitives.points import Columns
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
-from surfkit.testing.compare import unchanged
+from surfkit.testing.equality import unchanged
 from surfkit.testing.inputs import cloud
 
 

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.reference import Reference
 from surfkit.scene.camera import Camera
-from surfkit.testing.compare import assert_same, unchanged
+from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import splats
 
 NEAR_PLANE = 0.01

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset
 from surfkit.io.datasets.undistort import is_panorama
 from surfkit.partition.assign import Assign
 from surfkit.partition.base import Cells, CoarseModel, Ground, Partition
@@ -27,7 +27,7 @@ from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.scene.scene import SparsePoints, View
 from surfkit.start.base import Start, StartInput
-from surfkit.testing.compare import assert_same, unchanged
+from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import cloud, coarse_model, mesh_input, start_input, survey
 from surfkit.testing.synthetic import Synthetic
 from surfkit.train.refine.base import Refine

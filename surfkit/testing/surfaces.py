@@ -17,7 +17,7 @@ from surfkit.core.codec import dump
 from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_values
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.trust import Trust
-from surfkit.testing.compare import assert_same, unchanged
+from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import BALL_RADIUS, exact_depths, exact_priors, mesh_input, survey
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, Scene, SparsePoints, View
 

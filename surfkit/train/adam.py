@@ -10,8 +10,8 @@ from torch import Tensor
 
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster import native
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import CudaSource
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")

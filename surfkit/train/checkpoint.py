@@ -25,7 +25,7 @@ from surfkit.core.codec import load as load_value
 from surfkit.core.files import being_written, remove, sync_folder
 from surfkit.primitives.points import Points
 from surfkit.train.state import StageState
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 
 CHECKPOINT_FORMAT = "surfkit-stage-3"
 TENSOR_GROUPS = {"params": "params", "first": "exp_avg", "second": "exp_avg_sq", "stats": "stats"}

@@ -13,11 +13,11 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import DepthAlignment, Priors, prior_bytes, read_priors
 from surfkit.io.datasets.masks import mask_cache, mask_sizes
 from surfkit.losses.base import Loss
-from surfkit.raster.nvrtc.memory import free_gpu_bytes
+from surfkit.raster.nvrtc.gpu_memory import free_gpu_bytes
 from surfkit.scene.align import SCALE_BAND
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.cache import Cache, share
-from surfkit.scene.copies import DecodedPhotoCache
-from surfkit.scene.memory import cache_bytes
+from surfkit.scene.decoded_photos import DecodedPhotoCache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from surfkit.core.events import MemoryTaken, emit
 from surfkit.core.memory import highest_memory_bytes, peak_memory_bytes, reset_peak_memory, resident_bytes
-from surfkit.raster.nvrtc.memory import peak_gpu_bytes, reset_peak_gpu
+from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes, reset_peak_gpu
 from surfkit.train.data_cache import TrainingData
 from surfkit.train.state import StageState
 from surfkit.train.uploads import Uploads

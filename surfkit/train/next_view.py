@@ -13,7 +13,7 @@ from surfkit.raster.api import Maps, Splats
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.uploads import UploadedView
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 
 
 def foretell(setup: StageSetup, order: ViewOrder) -> None:

@@ -13,7 +13,7 @@ from surfkit.train.in_view import with_frozen
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step_result import StepResult
-from surfkit.train.views import ViewContributions
+from surfkit.train.view_order import ViewContributions
 
 
 def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
-from surfkit.raster.nvrtc.memory import peak_gpu_bytes
+from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.psnr import psnr
 from surfkit.train.trainer import CompletedStep
 

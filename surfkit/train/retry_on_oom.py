@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.memory import is_out_of_gpu_memory, size
-from surfkit.raster.nvrtc.memory import release_gpu
+from surfkit.raster.nvrtc.gpu_memory import release_gpu
 from surfkit.train.state import StageState
 from surfkit.train.uploads import Uploads
 

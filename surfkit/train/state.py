@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from surfkit.primitives.points import Columns, Points
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 
 
 @dataclass

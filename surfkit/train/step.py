@@ -20,7 +20,7 @@ from surfkit.train.in_view import PointsInView, with_frozen
 from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
 from surfkit.train.next_view import neighbour, next_target
 from surfkit.train.policies import told, wanted
-from surfkit.train.reads import GEOMETRY_MAPS, maps_of_step
+from surfkit.train.required_maps import GEOMETRY_MAPS, maps_of_step
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step_result import StepResult

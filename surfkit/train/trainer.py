@@ -15,14 +15,14 @@ from surfkit.losses.base import Target
 from surfkit.primitives.edit import OBSERVED_EVERY, observe
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps
-from surfkit.raster.nvrtc.memory import peak_gpu_bytes
+from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.train.image_appearance import fresh_appearances
 from surfkit.train.next_view import foretell
 from surfkit.train.retry_on_oom import retry_on_oom
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step import densify, update, view_gradients
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 from surfkit.train.watch import Stopwatch
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.cache import out_of_turn
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 
 Known = TypeVar("Known", Tensor, DepthPrior)
 

@@ -3,10 +3,10 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
-from surfkit.evaluate.images.measure import color_corrected, evaluate_views
+from surfkit.evaluate.images.measure_images import color_corrected, evaluate_views
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Maps
-from surfkit.raster.footprints import colors
+from surfkit.raster.projection import colors
 from surfkit.raster.psnr import psnr
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View

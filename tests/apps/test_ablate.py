@@ -10,7 +10,8 @@ import torch
 
 from surfkit.cli import main
 from surfkit.core import registry
-from surfkit.runs import pipeline, stage
+from surfkit.runs import pipeline
+from surfkit.runs import run_stage as stage
 from surfkit.study.recipes.ablations import TABLES
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

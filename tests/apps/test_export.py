@@ -10,11 +10,11 @@ import torch
 
 from surfkit.apps.export import ExportCommand, one_tile
 from surfkit.cli import main
-from surfkit.io.splats.files import format_of, read_splat_file
 from surfkit.io.splats.ply import PLY, read_splats
+from surfkit.io.splats.splat_files import format_of, read_splat_file
 from surfkit.io.splats.spz import SPZ
 from surfkit.scene.scene import Frame
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 
 @pytest.fixture

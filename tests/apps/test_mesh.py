@@ -9,7 +9,7 @@ from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.mesh.tsdf import TSDF
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

@@ -14,7 +14,7 @@ from needs import needs_native
 
 from surfkit.apps.components import by_kind, owner_of
 from surfkit.apps.new import write
-from surfkit.apps.new.names import Names
+from surfkit.apps.new.plugin_names import Names
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core import registry

@@ -17,7 +17,7 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import map_path
 from surfkit.losses import DepthRegression
-from surfkit.runs import stage
+from surfkit.runs import run_stage as stage
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

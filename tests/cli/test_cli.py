@@ -270,7 +270,7 @@ def test_it_runs_as_a_module(module, tmp_path):
 OUTLIVES = """
 import sys
 from pathlib import Path
-from surfkit.cli.streams import outlive_terminal
+from surfkit.cli.standard_streams import outlive_terminal
 outlive_terminal()
 outlive_terminal()
 print("on the terminal", flush=True)

@@ -10,12 +10,12 @@ import pytest
 from rich.console import Console
 
 from surfkit.cli import main
-from surfkit.cli.table import print_table, tell
+from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import printable
 from surfkit.core.events import Progress, Warned, emit, say
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.bars import bars
+from surfkit.train.progress_bars import bars
 
 NAME = "a\x1b[1mb[red].png"
 SHOWN = "a\\x1b[1mb[red].png"

@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from surfkit.compress.container import ModelFile, write_model
+from surfkit.compress.lossless import Float16, Lossless
 from surfkit.compress.octree import MAX_TREE_LEVELS, Leaf, interleaved, leaves, separated
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Float16, Lossless
 from surfkit.compress.scalars import LogSteps, MortonPositions, SmallestThree, UniformLevels
 from surfkit.core.check import BadInput
 from surfkit.primitives.columns import IDENTITY
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.model import SplatModel
-from surfkit.testing.compress import splat_model
+from surfkit.testing.compressor_checks import splat_model
 
 UTM = (492_000.0, 5_260_000.0, 430.0)
 DRAW = np.random.default_rng(0)

@@ -14,12 +14,12 @@ import pytest
 import zstandard
 
 from surfkit.compress.container import ModelFile, write_model
+from surfkit.compress.lossless import Lossless
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Lossless
 from surfkit.compress.streams import MAX_COMPONENTS, packed, unpacked
 from surfkit.core.check import BadInput
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.testing.compress import splat_model
+from surfkit.testing.compressor_checks import splat_model
 
 HEAD = struct.Struct("<8sIIQQQII")
 CASES = int(os.environ.get("SURFKIT_DAMAGED_FILES", 200))

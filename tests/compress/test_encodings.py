@@ -11,7 +11,7 @@ from surfkit.primitives import Surfel2D
 from surfkit.primitives.columns import standard_columns
 from surfkit.primitives.model import SplatModel
 from surfkit.testing import check_encoding
-from surfkit.testing.compress import column_values
+from surfkit.testing.compressor_checks import column_values
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

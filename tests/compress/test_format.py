@@ -10,12 +10,12 @@ import torch
 import zstandard
 
 from surfkit.compress import container
+from surfkit.compress.lossless import Float16, Lossless
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Float16, Lossless
 from surfkit.compress.vectree import Vectree
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.testing.compress import splat_model
+from surfkit.testing.compressor_checks import splat_model
 
 
 def read_file(data):

@@ -10,8 +10,8 @@ from needs import needs
 from surfkit import Activation, Column, LearningRate, Primitive, hookimpl, standard_columns
 from surfkit.compress.base import Plan
 from surfkit.compress.container import ModelFile, read_model, write_model
+from surfkit.compress.lossless import Float16, Lossless
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Float16, Lossless
 from surfkit.compress.vectree import Vectree
 from surfkit.core import registry
 from surfkit.core.check import BadInput
@@ -21,7 +21,7 @@ from surfkit.primitives.init import seeds
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.scene.scene import Frame
-from surfkit.testing.compress import column_values, splat_model
+from surfkit.testing.compressor_checks import column_values, splat_model
 
 hypothesis = needs("hypothesis")
 st = hypothesis.strategies

@@ -18,7 +18,7 @@ from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
-from surfkit.train.views import ViewContributions
+from surfkit.train.view_order import ViewContributions
 
 DRAW = torch.Generator().manual_seed(2)
 AMOUNT = torch.rand(7, 200, generator=DRAW) * 30

@@ -13,12 +13,13 @@ from PIL import Image
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
-from surfkit.depth import keep, prepare
+from surfkit.depth import depth_map_cache as keep
+from surfkit.depth import prepare_depth_maps as prepare
 from surfkit.depth.patch_match import PatchMatch
-from surfkit.depth.prepare import DepthPreparation
+from surfkit.depth.prepare_depth_maps import DepthPreparation
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_map_index import folder_of, read_made
 from surfkit.io.datasets.fingerprint import fingerprint
-from surfkit.io.datasets.made_maps import folder_of, read_made
 from surfkit.io.datasets.read import observations, read
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

@@ -10,7 +10,7 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
-from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve, pattern, way
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, pattern, way
 from surfkit.depth.neighbours import in_turn, neighbours
 from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace
 from surfkit.depth.plane_map import PlaneMap, load_map, save_map

@@ -10,11 +10,11 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
 from surfkit.depth.consistency import DepthConsistency, agreement, agreement_in_torch, at_edge
-from surfkit.depth.matching import PosedImage, cost_volume, ray_map
+from surfkit.depth.cost_volume import PosedImage, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.scanlines import best_planes, smooth_costs
+from surfkit.depth.semi_global_matching import best_planes, smooth_costs
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import observations, read
 from surfkit.scene.camera import Camera

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from surfkit.evaluate.geometry import comparison
 from surfkit.evaluate.geometry.comparison import Comparison, compare, warn_of_loss
 from surfkit.evaluate.geometry.scores import shares
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.scene.crop import Crop, write_crop
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from surfkit.evaluate.geometry.class_pictures import write_classes
 from surfkit.evaluate.geometry.classes import SEEN_FROM, class_figures, classify
 from surfkit.evaluate.geometry.comparison import Comparison, compare
-from surfkit.evaluate.geometry.normals import normals_at
 from surfkit.evaluate.geometry.repetition import ComparedSurface
 from surfkit.evaluate.geometry.sightings import near_edges, sightings
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface
+from surfkit.evaluate.geometry.surface_normals import normals_at
 from surfkit.evaluate.geometry.terrain import terrain
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.seams import Seams

@@ -11,9 +11,9 @@ from scipy.spatial import Delaunay
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.comparison import usual_visible
 from surfkit.evaluate.geometry.outline import outline
+from surfkit.evaluate.geometry.point_visibility import visible, visible_counts
 from surfkit.evaluate.geometry.scores import surface_gap, tree
-from surfkit.evaluate.geometry.surface import SurfaceFile
-from surfkit.evaluate.geometry.visibility import visible, visible_counts
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.evaluate.geometry.volume import CropSettings, heightened, outside_shares, visible_crop
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import Crop, read_crop, within, write_crop

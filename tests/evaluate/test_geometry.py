@@ -13,11 +13,11 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry import comparison, repetition
 from surfkit.evaluate.geometry.comparison import Comparison, compare
 from surfkit.evaluate.geometry.errors import error_colors
-from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.measure_geometry import measure_geometry
 from surfkit.evaluate.geometry.repetition import cloud_side
 from surfkit.evaluate.geometry.sampling import face_areas, sample_faces
 from surfkit.evaluate.geometry.scores import shares
-from surfkit.evaluate.geometry.surface import SurfaceFile, part_within, read_surface
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, part_within, read_surface
 from surfkit.evaluate.geometry.transform import apply, write_transform
 from surfkit.io.splats.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop

@@ -13,7 +13,7 @@ from surfkit.evaluate.geometry import thinning
 from surfkit.evaluate.geometry.registration import align
 from surfkit.evaluate.geometry.sampling import sample_surface
 from surfkit.evaluate.geometry.scores import Distances, chamfer, curve, nearest, shares, spacing, surface_gap, tree
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, fitted, read_transform, scale_of, write_transform
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.images import measure
-from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
+from surfkit.evaluate.images import measure_images as measure
+from surfkit.evaluate.images.measure_images import evaluate_views, frames_per_second
 from surfkit.raster.api import Maps
 from surfkit.raster.psnr import psnr
 from surfkit.testing.synthetic import Flight, photograph

@@ -20,7 +20,7 @@ from surfkit.evaluate.images.lpips import (
     load_perceptual,
     networks,
 )
-from surfkit.evaluate.images.measure import evaluate_views
+from surfkit.evaluate.images.measure_images import evaluate_views
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import Flight, photograph
 

@@ -8,13 +8,13 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface
 from surfkit.evaluate.mesh import boxes as cubes
 from surfkit.evaluate.mesh import crossing, roughness
 from surfkit.evaluate.mesh.boxes import boxes
 from surfkit.evaluate.mesh.crossing import crossing_faces, crossings
 from surfkit.evaluate.mesh.edges import boundary_edges, connections
-from surfkit.evaluate.mesh.measure import measure_mesh
+from surfkit.evaluate.mesh.measure_mesh import measure_mesh
 from surfkit.evaluate.mesh.roughness import radius_for, residuals
 from surfkit.evaluate.mesh.whole import whole_mesh
 from surfkit.scene.same_places import first_in_place

@@ -6,17 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from surfkit.evaluate.images.comparison_pictures import panel
 from surfkit.evaluate.images.lpips import Perceptual
-from surfkit.evaluate.images.measure import evaluate_views
-from surfkit.evaluate.images.pictures import panel
+from surfkit.evaluate.images.measure_images import evaluate_views
 from surfkit.partition import PictureShare, SSIMDifference
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.model import SplatModel
-from surfkit.runs.method import with_drawing
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.run_method import with_drawing
 from surfkit.testing.inputs import coarse_model
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, is_there, simulated_gpu
-from surfkit.train.views import ViewContributions
+from surfkit.train.view_order import ViewContributions
 
 pytestmark = pytest.mark.skipif(
     not any(shutil.which(name) for name in ("g++", "c++", "clang++")), reason="the emulator needs a C++ compiler"

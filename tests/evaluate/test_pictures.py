@@ -5,7 +5,14 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit.evaluate.images.pictures import RAMP, colour_depth, colour_normal, panel, picture_path, write_picture
+from surfkit.evaluate.images.comparison_pictures import (
+    RAMP,
+    colour_depth,
+    colour_normal,
+    panel,
+    picture_path,
+    write_picture,
+)
 from surfkit.raster.api import Maps
 
 

@@ -10,12 +10,12 @@ from needs import needs
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry import surface
-from surfkit.evaluate.geometry.highest import highest
+from surfkit.evaluate.geometry import surface_file as surface
+from surfkit.evaluate.geometry.file_transform import same_plan
 from surfkit.evaluate.geometry.las import read_las
-from surfkit.evaluate.geometry.place import same_plan
 from surfkit.evaluate.geometry.sampling import face_areas
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface, system_of
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface, system_of
+from surfkit.evaluate.geometry.top_surface import highest
 from surfkit.io.splats.ply import write_points
 
 trimesh = needs("trimesh")

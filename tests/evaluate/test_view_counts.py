@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from surfkit.evaluate.images import view_counts
-from surfkit.evaluate.images.parts import by_views, measure_parts
+from surfkit.evaluate.images.region_metrics import by_views, measure_parts
 from surfkit.evaluate.images.view_counts import DepthSource, count_views
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import SURFACES, Flight, photograph

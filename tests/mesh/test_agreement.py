@@ -9,10 +9,11 @@ from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
-from surfkit.mesh import native, tsdf
-from surfkit.mesh.agreement import GeometricConsistency, compare, compare_in_torch
+from surfkit.mesh import native_grid as native
+from surfkit.mesh import tsdf
+from surfkit.mesh.fusion_image import weighed
+from surfkit.mesh.geometric_consistency import GeometricConsistency, compare, compare_in_torch
 from surfkit.mesh.overlap import Depths, nearby, overlapping
-from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import View

@@ -7,9 +7,9 @@ from needs import needs
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import closed, open_or_crowded
-from surfkit.mesh.files import write_mesh
 from surfkit.mesh.holes import edges
 from surfkit.mesh.manifold import apart, separated
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.scene.scene import Frame
 
 trimesh = needs("trimesh")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from needs import needs
 
-from surfkit.apps.view.subject import local_mesh
+from surfkit.apps.view.viewer_scene import local_mesh
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.mesh.base import Mesh, require_values
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.mesh.simplify import simplify_to
 from surfkit.scene.scene import Frame
 
@@ -119,7 +119,7 @@ def test_open3d_reads_linear_colours(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
 def test_meshes_without_colour_and_large_ones(tmp_path, kind, monkeypatch):
-    monkeypatch.setattr("surfkit.mesh.files.BATCH_ROWS", 100)
+    monkeypatch.setattr("surfkit.mesh.mesh_export.BATCH_ROWS", 100)
     mesh = ball()
     path = tmp_path / f"mesh.{kind}"
     write_mesh(path, Mesh(mesh.vertices, mesh.faces), Frame(np.zeros(3), 0.5))
@@ -162,7 +162,7 @@ def test_values_are_properties_of_ply(tmp_path):
 
 def test_a_glb_file_byte_for_byte(tmp_path, monkeypatch):
     """Put together by hand; programs that compare files of two versions see no difference."""
-    monkeypatch.setattr("surfkit.mesh.files.own_version", lambda: "1.2.3")
+    monkeypatch.setattr("surfkit.mesh.mesh_export.own_version", lambda: "1.2.3")
     corners, path = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], np.float32), tmp_path / "mesh.glb"
     write_mesh(path, Mesh(corners, np.array([[0, 1, 2]], np.int32)), Frame(np.zeros(3), 1.0))
     text = (

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clusters
 from surfkit.mesh.floaters import drop_floaters
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.lattice import FusionImage
 from surfkit.mesh.tsdf import TSDF
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from surfkit.apps.result import mesh_rows
+from surfkit.apps.run_summary import mesh_rows
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.hooks import hookimpl

@@ -8,8 +8,8 @@ import torch
 from needs import needs, needs_native
 
 from surfkit.mesh.lattice import FusionImage, Lattice
-from surfkit.mesh.native import NativeGrid
-from surfkit.mesh.reference import ReferenceGrid
+from surfkit.mesh.native_grid import NativeGrid
+from surfkit.mesh.reference_grid import ReferenceGrid
 from surfkit.raster.native import module
 
 from .shapes import around, look_at, seen, slope, sphere, torus

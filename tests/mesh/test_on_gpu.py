@@ -8,8 +8,8 @@ import torch
 
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import fusion, tsdf
-from surfkit.mesh.agreement import GeometricConsistency
-from surfkit.mesh.cuda import grid as gpu_grid
+from surfkit.mesh.cuda import gpu_grid as gpu_grid
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.reference import Reference

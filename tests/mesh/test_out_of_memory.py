@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from surfkit.mesh.lattice import Lattice, Picture
-from surfkit.mesh.native import NativeGrid
+from surfkit.mesh.native_grid import NativeGrid
 from surfkit.scene.camera import Camera
 
 torch.set_num_threads(2)

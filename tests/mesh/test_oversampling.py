@@ -9,7 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import oversampling
-from surfkit.mesh.agreement import GeometricConsistency
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.oversampling import magnified, oversampled
 from surfkit.mesh.tsdf import TSDF
 

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh import sky as module
-from surfkit.mesh.agreement import GeometricConsistency
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.sky import may_show_sky, sky, without_sky
 from surfkit.mesh.tsdf import TSDF
 

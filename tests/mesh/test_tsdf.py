@@ -13,12 +13,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.mesh import fusion, native, tsdf
+from surfkit.mesh import fusion, tsdf
+from surfkit.mesh import native_grid as native
+from surfkit.mesh.fusion_image import depth_of, picture
+from surfkit.mesh.fusion_lengths import MIN_TRUNCATION_VOXELS, without_hidden
+from surfkit.mesh.grid_tiles import BlockRange, different
 from surfkit.mesh.lattice import BLOCK_SIDE_VOXELS, Lattice, least_slant
-from surfkit.mesh.lengths import MIN_TRUNCATION_VOXELS, without_hidden
-from surfkit.mesh.picture import depth_of, picture
-from surfkit.mesh.reference import ReferenceGrid, unpack
-from surfkit.mesh.tiles import BlockRange, different
+from surfkit.mesh.reference_grid import ReferenceGrid, unpack
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.scene.camera import Camera
@@ -191,7 +192,7 @@ def test_a_grid_that_outgrows_its_memory_is_cut_until_it_fits(monkeypatch):
 
 
 def test_the_estimate_is_of_the_right_size():
-    from surfkit.mesh.tiles import estimate
+    from surfkit.mesh.grid_tiles import estimate
 
     for voxel in (0.015, 0.05):
         given = subject(around(24), sphere)
@@ -346,7 +347,7 @@ def test_compiled_shades_are_those_of_numpy(monkeypatch):
     noisy.color[0, 3, 4], noisy.normal[:, 36, 50] = torch.nan, 0
     for some in (noisy, replace(noisy, normal=None)):
         one = picture(maps.depth, some, camera, 0.015, 0.03)
-        monkeypatch.setattr("surfkit.mesh.picture.module", lambda: None)
+        monkeypatch.setattr("surfkit.mesh.fusion_image.module", lambda: None)
         other = picture(maps.depth, some, camera, 0.015, 0.03)
         monkeypatch.undo()
         assert np.array_equal(one.shade, other.shade) and len(np.unique(one.shade >> 24)) > 5

@@ -11,15 +11,15 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.mesh.adjust import adjusted, face_normals
-from surfkit.mesh.agreement import GeometricConsistency
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.manifold import separated
-from surfkit.mesh.points import boxes_with, gather, merged
-from surfkit.mesh.sights import ObservationSettings, ViewObservation
-from surfkit.mesh.sights import seen as seen_by_all
+from surfkit.mesh.refine_vertices import adjusted, face_normals
+from surfkit.mesh.surface_points import boxes_with, gather, merged
+from surfkit.mesh.view_observations import ObservationSettings, ViewObservation
+from surfkit.mesh.view_observations import seen as seen_by_all
 from surfkit.mesh.visibility import OUTWARD, Visibility
 from surfkit.raster.native import module
 from surfkit.testing import check_mesher

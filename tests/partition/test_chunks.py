@@ -10,7 +10,7 @@ from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.partition import ContractedGrid, QuantileGrid, SparsePointShare, SquareGrid
 from surfkit.partition.plan import BlockMinimums, plan, thinned
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.observations import Observations, Observations2D

@@ -9,7 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.losses.base import RegularizerInput
 from surfkit.losses.consensus import Consensus, column
-from surfkit.partition.consensus import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
+from surfkit.partition.admm import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
 from surfkit.testing.inputs import splats
 
 IDS = [[0, 1, 2, 3, 5], [1, 2, 4, 5], [2, 3, 5, 6]]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.table import THINNESS, SplatTable
+from surfkit.io.splats.splat_table import THINNESS, SplatTable
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.columns import IDENTITY, Column
 from surfkit.primitives.raw import cloud_of, product, raw_columns

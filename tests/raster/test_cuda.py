@@ -9,8 +9,8 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import MAPS, STANDARD, Maps, Rasterizer
-from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.reference import Reference
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.raster import native
 from surfkit.raster.api import ALPHA_MIN, MAPS, STANDARD, Maps, Render, Splats
-from surfkit.raster.compiled import NativeRasterizer
-from surfkit.raster.footprints import footprints
+from surfkit.raster.native_rasterizer import NativeRasterizer
+from surfkit.raster.projection import footprints
 from surfkit.raster.reference import Reference, draw
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera

@@ -6,8 +6,8 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit.raster.compiled import NativeRasterizer
-from surfkit.raster.outlook import may_touch
+from surfkit.raster.culling import may_touch
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.reference import Reference
 
 from .scenes import NEAR, PRIMITIVE_KINDS, Draw, camera, double, splats

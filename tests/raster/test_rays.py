@@ -10,7 +10,7 @@ from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.compiled import NativeRasterizer
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.rays import ray_opacity, ray_opacity_reference
 from surfkit.raster.reference import Reference
 

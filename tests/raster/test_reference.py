@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from surfkit.raster.api import Maps, Splats
-from surfkit.raster.footprints import colors, footprints, gaussians, sh_basis
+from surfkit.raster.projection import colors, footprints, gaussians, sh_basis
 from surfkit.raster.reference import Reference, draw
 
 from .plain import evaluate, harmonics, rotation

@@ -13,9 +13,9 @@ from surfkit import hookimpl
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.compiled import NativeRasterizer
 from surfkit.raster.cuda import gpu
 from surfkit.raster.cuda.gpu import CudaRasterizer
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select, torch_device
 

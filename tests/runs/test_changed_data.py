@@ -8,7 +8,7 @@ import shutil
 import pytest
 from needs import needs
 
-from surfkit.apps.view.subject import opened_subject
+from surfkit.apps.view.viewer_scene import opened_subject
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data

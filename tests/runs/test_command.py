@@ -12,7 +12,7 @@ from surfkit.cli import main
 from surfkit.cli.parse import parse
 from surfkit.core.registry import offered_once
 from surfkit.io.datasets.data import Data, ReadSettings
-from surfkit.runs import stage
+from surfkit.runs import run_stage as stage
 from surfkit.runs.command import train_command
 from surfkit.runs.folder import Run, read_data
 from surfkit.runs.pipeline import opened

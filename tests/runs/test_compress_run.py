@@ -16,11 +16,11 @@ from surfkit.compress.packed import Packed
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
-from surfkit.io.splats.files import read_splat_file
+from surfkit.io.splats.splat_files import read_splat_file
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives import Surfel2D
-from surfkit.runs.blocks.schedule import Compute
-from surfkit.runs.compress import CompressionTarget, fitted, importance_of
+from surfkit.runs.blocks.train_blocks import Compute
+from surfkit.runs.compress_model import CompressionTarget, fitted, importance_of
 from surfkit.runs.folder import discard_results
 from surfkit.runs.pipeline import loaded, run, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

@@ -6,19 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit.apps.report.sections.resources import resources
-from surfkit.apps.report.source import read_source
-from surfkit.apps.result import result_rows
+from surfkit.apps.report.run_files import read_source
+from surfkit.apps.report.sections.resources_section import resources
+from surfkit.apps.run_summary import result_rows
 from surfkit.apps.status import rows
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import Fault
 from surfkit.core.tree import evolve
-from surfkit.evaluate.images.measure import evaluate_views
+from surfkit.evaluate.images.measure_images import evaluate_views
 from surfkit.io.datasets.data import Data
 from surfkit.raster.select import select
-from surfkit.runs import measure, pipeline
+from surfkit.runs import measure_run as measure
+from surfkit.runs import pipeline
 from surfkit.runs.pipeline import Intervals, run, with_steps
-from surfkit.runs.status import status
+from surfkit.runs.run_status import status
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import trainer

@@ -11,7 +11,7 @@ from needs import needs_native
 
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.io.datasets.made_maps import read_made
+from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native

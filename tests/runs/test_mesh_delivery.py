@@ -11,12 +11,12 @@ from surfkit.core.codec import write_json
 from surfkit.core.events import Warned
 from surfkit.io import glb
 from surfkit.io.datasets.data import Data
-from surfkit.mesh import files
+from surfkit.mesh import mesh_export as files
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.simplify import simplified
-from surfkit.runs import mesh as delivering
+from surfkit.runs import make_mesh as delivering
 from surfkit.runs.folder import Run
-from surfkit.runs.mesh import MeshOutput, finished, forget_geometry, levels, write_files
+from surfkit.runs.make_mesh import MeshOutput, finished, forget_geometry, levels, write_files
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.scene import Frame
 

@@ -11,14 +11,14 @@ from surfkit.cli.recipes import recipes
 from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.compress.vectree import Vectree
 from surfkit.io.datasets.data import Data
-from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.mesh.cuda.gpu_grid import GpuGrid
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives import Surfel2D
 from surfkit.raster.select import select
 from surfkit.runs import pipeline
-from surfkit.runs.blocks.schedule import Compute
-from surfkit.runs.compress import compress_run
-from surfkit.runs.mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.blocks.train_blocks import Compute
+from surfkit.runs.compress_model import compress_run
+from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
 from surfkit.runs.pipeline import loaded, run, with_steps
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

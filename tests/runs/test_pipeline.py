@@ -21,8 +21,9 @@ from surfkit.io.splats.ply import read_splats
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import QuantileGrid
 from surfkit.primitives import Flat3D, Surfel2D
-from surfkit.runs import pipeline, stage, warn
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs import pipeline, warn
+from surfkit.runs import run_stage as stage
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute import Pool
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import Intervals, load_run, run, with_steps

@@ -16,19 +16,19 @@ from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.lock import IN_USE_FILE, is_used, locked, mark_used
 from surfkit.core.tree import evolve
-from surfkit.depth.keep import make_room
+from surfkit.depth.depth_map_cache import make_room
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import map_path
-from surfkit.io.datasets.made_maps import folder_of, located, read_made
+from surfkit.io.datasets.depth_map_index import folder_of, located, read_made
 from surfkit.losses import DepthRegression, NormalPrior
 from surfkit.partition import PictureShare, QuantileGrid
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute import Pool
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.start.stereo import StereoStart
+from surfkit.start.stereo_start import StereoStart
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
@@ -182,7 +182,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
             raise KeyboardInterrupt
         return take(self, state)
 
-    from surfkit.runs.stage import Intervals
+    from surfkit.runs.run_stage import Intervals
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", stopped)

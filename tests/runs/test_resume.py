@@ -92,7 +92,7 @@ def interrupted(recipe, data, out, at, monkeypatch, **settings):
                 os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr("surfkit.runs.stage.TrainingDisplay", Interrupting)
+        patch.setattr("surfkit.runs.run_stage.TrainingDisplay", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, out, **settings)
 
@@ -391,7 +391,7 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
 
 def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkeypatch):
     free = iter([1 << 30, 100 << 20])  # looked at every ten steps
-    monkeypatch.setattr("surfkit.runs.stage.free_bytes", lambda: next(free))
+    monkeypatch.setattr("surfkit.runs.run_stage.free_bytes", lambda: next(free))
     assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
     assert len(notes(tmp_path / "run")) == 1
     assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")

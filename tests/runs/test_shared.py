@@ -16,13 +16,13 @@ from surfkit.io.datasets.fingerprint import fingerprint
 from surfkit.io.datasets.read import read
 from surfkit.losses.depth import DepthRegression
 from surfkit.mesh.tsdf import TSDF
-from surfkit.runs import shared
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs import run_cache as shared
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.shared import inputs_of, part_keys, read_shared
-from surfkit.runs.store import StageCache
+from surfkit.runs.run_cache import inputs_of, part_keys, read_shared
+from surfkit.runs.stage_cache import StageCache
 from surfkit.study.recipes import RECIPES
 from surfkit.train import checkpoint
 
@@ -153,7 +153,7 @@ def test_other_blocks_begin_with_the_same_coarse_model(data, recipe, tmp_path, b
 def test_a_run_that_was_interrupted_goes_on_with_what_another_has_finished(data, recipe, undisturbed, tmp_path, began):
     from two_blocks import stop_after
 
-    from surfkit.runs import stage
+    from surfkit.runs import run_stage as stage
 
     store = StageCache(tmp_path / "stages")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):

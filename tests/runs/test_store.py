@@ -7,8 +7,8 @@ import pytest
 from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.runs import store as store_module
-from surfkit.runs.store import ENTRY_RECORD, StageCache
+from surfkit.runs import stage_cache as store_module
+from surfkit.runs.stage_cache import ENTRY_RECORD, StageCache
 
 NAMES = ["events.jsonl", "pretrain/checkpoint.safetensors"]
 

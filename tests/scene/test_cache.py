@@ -6,10 +6,10 @@ import threading
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.scene import memory
+from surfkit.scene import available_memory as memory
+from surfkit.scene.available_memory import cache_bytes, free_bytes
+from surfkit.scene.byte_semaphore import ByteSemaphore
 from surfkit.scene.cache import Cache, share
-from surfkit.scene.gate import ByteSemaphore
-from surfkit.scene.memory import cache_bytes, free_bytes
 
 
 class Shelf:

@@ -9,8 +9,8 @@ from surfkit.core.codec import write_json
 from surfkit.io.datasets.depth_files import map_path, write_map
 from surfkit.io.datasets.depth_layout import DepthQuery
 from surfkit.io.datasets.depth_layouts import HierarchicalDepths
-from surfkit.runs.notes import collect_notes
-from surfkit.scene.names import find_files, safe_path
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.photo_names import find_files, safe_path
 
 
 def test_names_without_endings_are_found_in_time_that_grows_with_their_number(tmp_path, monkeypatch):

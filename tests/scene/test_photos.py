@@ -8,10 +8,10 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.scene import photos
 from surfkit.scene.camera import Camera
-from surfkit.scene.copies import DecodedPhotoCache
+from surfkit.scene.decoded_photos import DecodedPhotoCache
 from surfkit.scene.photos import is_turned, photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 

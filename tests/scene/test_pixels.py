@@ -10,7 +10,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
-from surfkit.scene import jpeg, large, photos
+from surfkit.scene import jpeg, photos
+from surfkit.scene import large_photos as large
 from surfkit.scene.photos import open_picture, read_draft, read_photo, refuse_large
 from surfkit.scene.pixels import Pixels, is_opacity, kind_of, largest_of, opacity_of, white_level_of
 from tests.needs import needs

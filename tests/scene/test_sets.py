@@ -1,6 +1,6 @@
 import numpy as np
 
-from surfkit.scene.sets import MAX_CACHED_NUMBERS, is_among
+from surfkit.scene.set_membership import MAX_CACHED_NUMBERS, is_among
 
 
 def test_as_the_sets_of_python() -> None:

@@ -9,14 +9,14 @@ from models import ORIGIN, data_set, like_3dgs
 
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.io.splats.axes import turn_between
-from surfkit.io.splats.files import read_splat_file
+from surfkit.io.splats.file_axes import turn_between
+from surfkit.io.splats.rotate_splats import turned
+from surfkit.io.splats.splat_files import read_splat_file
 from surfkit.io.splats.spz import SPZ
-from surfkit.io.splats.turn import turned
-from surfkit.runs.notes import collect_notes
-from surfkit.start.axes import read_in_scene
+from surfkit.runs.run_notes import collect_notes
 from surfkit.start.base import StartInput
-from surfkit.start.splats import SplatStart
+from surfkit.start.guess_axes import read_in_scene
+from surfkit.start.splat_start import SplatStart
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,12 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.start import carve, closing
+from surfkit.start import carving_grid as carve
+from surfkit.start import space_carving as closing
 from surfkit.start.base import StartInput
-from surfkit.start.carve import CarvingGrid, Votes, meet, solid_of, votes
-from surfkit.start.closing import not_seen_through
-from surfkit.start.stereo import StereoStart
+from surfkit.start.carving_grid import CarvingGrid, Votes, meet, solid_of, votes
+from surfkit.start.space_carving import not_seen_through
+from surfkit.start.stereo_start import StereoStart
 from surfkit.start.voxels import Samples
 from surfkit.testing import synthetic
 from surfkit.testing.synthetic import Box, Flight, GroundPlane, photograph

@@ -19,7 +19,7 @@ from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
 from surfkit.runs.pipeline import Intervals, load_run, run, with_steps
 from surfkit.start.base import StartInput
-from surfkit.start.splats import SplatStart
+from surfkit.start.splat_start import SplatStart
 from surfkit.testing import check_start
 from surfkit.testing.inputs import start_input
 from surfkit.train.trainer import Trainer

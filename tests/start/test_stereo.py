@@ -15,9 +15,9 @@ from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.scene.scene import SparsePoints
 from surfkit.start.base import Start, StartInput
 from surfkit.start.depth_points import normals_of
-from surfkit.start.plain import RandomStart, SparseStart
-from surfkit.start.splats import SplatStart
-from surfkit.start.stereo import StereoStart, pixel_size
+from surfkit.start.simple_starts import RandomStart, SparseStart
+from surfkit.start.splat_start import SplatStart
+from surfkit.start.stereo_start import StereoStart, pixel_size
 from surfkit.start.voxels import Samples, VoxelAccumulator, apart, thin, thin_to
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
@@ -190,7 +190,7 @@ def test_a_few_points_are_no_noise(farm, few):
 
 def test_fewer_points_than_asked_for_are_told(farm, monkeypatch):
     said = []
-    monkeypatch.setattr("surfkit.start.stereo.emit", said.append)
+    monkeypatch.setattr("surfkit.start.stereo_start.emit", said.append)
 
     def told(start):
         said.clear()

@@ -20,9 +20,9 @@ from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe, without_unused
 from surfkit.study import ablation
 from surfkit.study.ablation import Row, Table, build, built_on, limit_points, offered_tables, pick, scaled
-from surfkit.study.columns import MESH_COLUMNS, TABLE_COLUMNS
-from surfkit.study.compare import compare
-from surfkit.study.recipes import city, surface
+from surfkit.study.metric_columns import MESH_COLUMNS, TABLE_COLUMNS
+from surfkit.study.recipes import city
+from surfkit.study.recipes import surface_recipes as surface
 from surfkit.study.recipes.ablations import (
     COARSE_BASELINE,
     GRADIENT_TABLE,
@@ -33,7 +33,8 @@ from surfkit.study.recipes.ablations import (
     TABLES,
     TRIM_TABLE,
 )
-from surfkit.study.recipes.surface import STEREO
+from surfkit.study.recipes.surface_recipes import STEREO
+from surfkit.study.row_comparison import compare
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
 FALLBACKS = Table(

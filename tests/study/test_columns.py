@@ -1,7 +1,7 @@
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.study.columns import TABLE_COLUMNS, refuse_unknown_columns, shown_columns
+from surfkit.study.metric_columns import TABLE_COLUMNS, refuse_unknown_columns, shown_columns
 
 
 @pytest.mark.parametrize(

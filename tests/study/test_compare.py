@@ -2,8 +2,8 @@ import pytest
 
 from surfkit.core.check import BadInput
 from surfkit.study.ablation import Row, Table
-from surfkit.study.compare import compare, deviation, difference, figures
 from surfkit.study.recipes.ablations import COARSE_BASELINE
+from surfkit.study.row_comparison import compare, deviation, difference, figures
 
 TABLE = Table(
     "small",

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.evaluate.geometry.chart import PlotLine, write_lines
+from surfkit.evaluate.geometry.line_plot import PlotLine, write_lines
 
 BLUE, ORANGE = (31, 119, 180), (255, 127, 14)
 

@@ -12,14 +12,14 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
 from surfkit.mesh.stereo import Stereo
 from surfkit.runs.folder import read_record
-from surfkit.runs.methods.stereo import StereoFusion
+from surfkit.runs.methods.stereo_fusion import StereoFusion
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.store import StageCache
-from surfkit.start.stereo import StereoStart
-from surfkit.study.notes import lines_on_depth, notes_of, row_numbers
+from surfkit.runs.stage_cache import StageCache
+from surfkit.start.stereo_start import StereoStart
+from surfkit.study.ablation_warnings import lines_on_depth, notes_of, row_numbers
 from surfkit.study.rows import Trial
-from surfkit.study.table import note_lines
+from surfkit.study.table_text import note_lines
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.stage import Stage
 

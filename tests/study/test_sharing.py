@@ -16,7 +16,7 @@ import pytest
 from needs import needs_native
 from two_blocks import data, recipe
 
-from surfkit.apps.forecast import foretell, needs_of, stage_steps
+from surfkit.apps.ablation_forecast import foretell, needs_of, stage_steps
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
@@ -27,9 +27,9 @@ from surfkit.runs.execute.base import Job, JobResult, Pool
 from surfkit.runs.pipeline import run
 from surfkit.study import rows
 from surfkit.study.ablation import Row, Table
-from surfkit.study.recipes.surface import SURFACE
+from surfkit.study.recipes.surface_recipes import SURFACE
 from surfkit.study.rows import OUTCOME_FILE, TrialJob, TrialResult, main, outcome_of
-from surfkit.study.sharing import finished_keys, keys_of, next_wave, sharing_lines
+from surfkit.study.shared_stages import finished_keys, keys_of, next_wave, sharing_lines
 from surfkit.study.study import AblationPlan, ablate, trials
 
 __all__ = ["data", "recipe"]

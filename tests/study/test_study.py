@@ -20,15 +20,15 @@ from surfkit.io.datasets.depth_prior import SWITCHED_OFF
 from surfkit.io.datasets.fingerprint import fingerprint as data_fingerprint
 from surfkit.io.datasets.read import read
 from surfkit.losses.depth import DepthRegression
-from surfkit.runs import shared
+from surfkit.runs import run_cache as shared
 from surfkit.runs.folder import Run
-from surfkit.runs.methods.stereo import StereoFusion
+from surfkit.runs.methods.stereo_fusion import StereoFusion
 from surfkit.study import rows
 from surfkit.study.ablation import Row, Table, build
+from surfkit.study.ablation_screen import AblationScreen
 from surfkit.study.recipes.ablations import COARSE_BASELINE, MODEL_TABLE, TABLES, stereo_alone
-from surfkit.study.recipes.surface import STEREO
+from surfkit.study.recipes.surface_recipes import STEREO
 from surfkit.study.rows import TrialResult
-from surfkit.study.screen import AblationScreen
 from surfkit.study.study import (
     AblationPlan,
     ablate,
@@ -39,7 +39,7 @@ from surfkit.study.study import (
     trials,
     unfinished,
 )
-from surfkit.study.table import lines, markdown
+from surfkit.study.table_text import lines, markdown
 from surfkit.study.truth import Truth
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import TrainingDisplay
@@ -457,7 +457,8 @@ def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
 
 def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
     """They are measured once, in the volume that is kept, and stand below the rows; a bad one does not stop others."""
-    from surfkit.study import others, truth
+    from surfkit.study import foreign_meshes as others
+    from surfkit.study import truth
 
     calls = []
 
@@ -512,7 +513,8 @@ def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
     ],
 )
 def test_meshes_that_cannot_be_rows(data, tmp_path, words, change, message):
-    from surfkit.study import others, truth
+    from surfkit.study import foreign_meshes as others
+    from surfkit.study import truth
 
     (tmp_path / "gt.ply").write_text("a truth")
     with pytest.raises(BadInput, match=message):

@@ -9,11 +9,11 @@ from rich.console import Console
 
 from surfkit.core.check import BadInput
 from surfkit.study.ablation import Row, Table
-from surfkit.study.compare import compare
 from surfkit.study.latex import escape, latex
 from surfkit.study.recipes.ablations import COARSE_BASELINE
+from surfkit.study.row_comparison import compare
 from surfkit.study.runs_csv import comma_separated
-from surfkit.study.table import best_rows, columns_of, drawing, failures, lines, markdown
+from surfkit.study.table_text import best_rows, columns_of, drawing, failures, lines, markdown
 
 TABLE = Table(
     "looks",

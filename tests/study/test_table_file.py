@@ -13,7 +13,7 @@ from surfkit.core.tree import evolve
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
 from surfkit.study.ablation import build, built_on
-from surfkit.study.columns import TABLE_COLUMNS
+from surfkit.study.metric_columns import TABLE_COLUMNS
 from surfkit.study.recipes import RECIPES
 from surfkit.study.table_file import is_table_file, read_table
 

@@ -9,8 +9,8 @@ import torch
 
 from surfkit.compress.base import Compressor
 from surfkit.compress.encoding import Encoding, flat, stream
+from surfkit.compress.lossless import Lossless
 from surfkit.compress.packed import Packed
-from surfkit.compress.plain import Lossless
 from surfkit.compress.scalars import Floats, float_bits
 from surfkit.core import hooks, registry
 from surfkit.primitives.columns import standard_columns

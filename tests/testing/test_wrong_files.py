@@ -9,7 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import SPLAT_COLUMNS
+from surfkit.io.splats.splat_table import SPLAT_COLUMNS
 from surfkit.testing import check_format
 
 
@@ -29,7 +29,7 @@ class Saved(Format):
         return table
 
     def read(self, path):
-        from surfkit.io.splats.table import SplatTable
+        from surfkit.io.splats.splat_table import SplatTable
 
         try:
             return SplatTable(*torch.load(path)["values"])
@@ -110,7 +110,7 @@ class NoNumbers(Saved):
 
 class Trusts(Saved):
     def read(self, path):
-        from surfkit.io.splats.table import SplatTable
+        from surfkit.io.splats.splat_table import SplatTable
 
         return SplatTable(*torch.load(path)["values"])
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from surfkit.compress.levels import LevelsOfDetail, MergedLevels
-from surfkit.compress.levels.tree import LodBlock, LodTree
+from surfkit.compress.levels.lod_tree import LodBlock, LodTree
 from surfkit.testing import check_levels_of_detail
 
 

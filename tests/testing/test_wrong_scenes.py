@@ -8,7 +8,7 @@ import torch
 from surfkit.partition.assign import Assign, PictureShare
 from surfkit.partition.base import Cells, Ground, Partition
 from surfkit.start.base import InitialModel, Start
-from surfkit.start.plain import SparseStart
+from surfkit.start.simple_starts import SparseStart
 from surfkit.testing import check_assign, check_partition, check_refine, check_start
 from surfkit.train.refine import PruneAndRecover
 from surfkit.train.refine.base import Refine

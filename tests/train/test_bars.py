@@ -5,8 +5,8 @@ import io
 from rich.console import Console
 
 from surfkit.core.events import Progress, emit
-from surfkit.train.bars import ProgressBars, bars
 from surfkit.train.progress import outer
+from surfkit.train.progress_bars import ProgressBars, bars
 
 
 def test_without_a_terminal_there_is_a_line_now_and_then():

@@ -11,7 +11,7 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
 from surfkit.losses.photometric import L1, SSIM
-from surfkit.raster.nvrtc.memory import peak_gpu_bytes
+from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.scene.cache import Cache
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, simulated_gpu
 from surfkit.train.data_cache import TrainingData

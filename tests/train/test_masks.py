@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surfkit.core.registry import components
-from surfkit.evaluate.images.measure import evaluate_views
+from surfkit.evaluate.images.measure_images import evaluate_views
 from surfkit.losses.base import Loss, ignoring
 from surfkit.raster.api import Maps
 from surfkit.testing import inputs

@@ -9,7 +9,7 @@ from surfkit.core.events import MemoryTaken
 from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import peak_memory_bytes, reset_peak_memory
 from surfkit.core.registry import plugins
-from surfkit.runs.notes import RunNotes
+from surfkit.runs.run_notes import RunNotes
 from surfkit.train.memory_meter import MemoryMeter
 
 LARGE = 300_000_000

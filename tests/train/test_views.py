@@ -1,6 +1,6 @@
 import torch
 
-from surfkit.train.views import ViewContributions, ViewOrder
+from surfkit.train.view_order import ViewContributions, ViewOrder
 
 
 def test_every_view_is_shown_once_in_each_round_in_an_order_of_the_generator():

@@ -16,16 +16,16 @@ from surfkit_sugar.triangles import ellipses, frames, packed, pairs
 
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.splats.ply import read_splats
 from surfkit.mesh.poisson import require_open3d
 from surfkit.mesh.simplify import require_simplification
 from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, components, evolve, hookimpl
 from surfkit.primitives import Surfel2D
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import load_run, run
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.scene.rotations import rotations
 from surfkit.testing import check
 from surfkit.testing.inputs import mesh_input, splats

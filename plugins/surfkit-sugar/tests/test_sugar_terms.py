@@ -20,7 +20,7 @@ from surfkit.losses.base import Target
 from surfkit.plugin import BadInput, Maps, Points, Regularizer, RegularizerInput, Splats, View, components, dump, load
 from surfkit.primitives.edit import Edit, apply
 from surfkit.raster.select import select
-from surfkit.runs.shared import part_keys
+from surfkit.runs.run_cache import part_keys
 from surfkit.testing import check
 from surfkit.testing.inputs import above, crowd, splats, survey
 from surfkit.train import checkpoint

@@ -14,14 +14,14 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.apps.doctor.default_steps import with_usual_steps
 from surfkit.apps.doctor.estimate import ResourceEstimate, duration, likely_range
 from surfkit.apps.doctor.examine import Diagnosis, Told, examine
 from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding
 from surfkit.apps.doctor.forecast import ProbePlan, forecast
 from surfkit.apps.doctor.machine import Machine, machine
-from surfkit.apps.doctor.usual_steps import with_usual_steps
+from surfkit.cli.console_table import print_table
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
-from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput, printable
 from surfkit.core.codec import dump
 from surfkit.core.memory import size

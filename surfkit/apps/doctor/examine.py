@@ -14,25 +14,25 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.doctor.estimate import ResourceEstimate
-from surfkit.apps.doctor.exposure import exposures
+from surfkit.apps.doctor.examine_photos import Photograph, PhotoToExamine, look_at
+from surfkit.apps.doctor.exposure_spread import exposures
 from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding, of_each
 from surfkit.apps.doctor.gather import Gathered, gather
 from surfkit.apps.doctor.geometry import Geometry, seen_by, survey
-from surfkit.apps.doctor.photographs import Photograph, PhotoToExamine, look_at
 from surfkit.apps.doctor.priors import priors
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
-from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import empty_masks
 from surfkit.io.datasets.panoramas import CUBE_FACES, points_remedy, size_to_read, view_names, view_sizes
 from surfkit.io.datasets.panoramas import PANORAMAS_FOLDER as PANORAMAS
+from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.io.datasets.read import RANDOM_POINTS, check_size
 from surfkit.io.datasets.undistort import cache_folder, is_panorama, is_pinhole
 from surfkit.runs.recipe import Recipe
-from surfkit.scene.copies import place
-from surfkit.scene.groups import groups_warning, untied_warning
+from surfkit.scene.connected_photos import groups_warning, untied_warning
+from surfkit.scene.decoded_photos import place
 from surfkit.scene.photos import refuse_large
 
 Told = Callable[[str, int, int], None]

@@ -25,9 +25,9 @@ from surfkit.io.datasets.read import build_scene
 from surfkit.io.datasets.undistort import cache_folder, is_pinhole
 from surfkit.raster.select import Device
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.stage import CHECKPOINT_EVERY
-from surfkit.scene.copies import place
-from surfkit.scene.memory import cache_bytes, free_bytes
+from surfkit.runs.run_stage import CHECKPOINT_EVERY
+from surfkit.scene.available_memory import cache_bytes, free_bytes
+from surfkit.scene.decoded_photos import place
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import needs_normals, needs_priors
 

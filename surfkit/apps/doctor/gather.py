@@ -15,15 +15,15 @@ from surfkit.core.check import BadInput, collecting
 from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import name_of, plugins
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.masks import MASK_MARKS, MASKS_FOLDER, find_masks, with_opacity
 from surfkit.io.datasets.panoramas import view_names
-from surfkit.io.datasets.pixels import PixelInterpretation, decide
+from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.read import model_folder, read_capture, reader_of
-from surfkit.scene.names import PICTURE_SUFFIXES
+from surfkit.scene.photo_names import PICTURE_SUFFIXES
 from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surfkit.apps.doctor.coverage_gaps import holes
 from surfkit.apps.doctor.finding import Finding, from_errors
-from surfkit.apps.doctor.holes import holes
 from surfkit.core.check import BadInput, few
-from surfkit.io.datasets.capture import RawImage
+from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.io.datasets.undistort import check_camera, is_panorama
 from surfkit.scene.scene import Frame
 

@@ -10,7 +10,7 @@ from surfkit.apps.doctor.gather import Gathered, depth_maps, heard
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import reading_again
 from surfkit.core.registry import name_of
-from surfkit.depth.prepare import REMEDY, others_warning
+from surfkit.depth.prepare_depth_maps import REMEDY, others_warning
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import SWITCHED_OFF, alignment, normals_warning, prepare_command
 from surfkit.io.datasets.panoramas import has_panoramas, points_remedy, view_names, view_sizes

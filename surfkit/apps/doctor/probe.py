@@ -23,15 +23,15 @@ import torch
 
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.densify.base import Prune, Step
-from surfkit.evaluate.images.pictures import panel, write_picture
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.evaluate.images.comparison_pictures import panel, write_picture
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.io.datasets.masks import view_mask
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.splats.ply import write_splats
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.edit import Edit, apply
 from surfkit.primitives.points import Points
-from surfkit.raster.nvrtc.memory import free_gpu_bytes, peak_gpu_bytes
+from surfkit.raster.nvrtc.gpu_memory import free_gpu_bytes, peak_gpu_bytes
 from surfkit.raster.select import Device, select
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.photos import view_photo

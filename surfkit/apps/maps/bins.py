@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from surfkit.apps.maps.grid import MapGrid, Window
+from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.zbuffer import boxes
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
 BATCH_TRIANGLES = 1 << 19
 """Triangles in memory at a time."""

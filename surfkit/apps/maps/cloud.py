@@ -15,7 +15,7 @@ from surfkit.core.events import Progress, emit
 from surfkit.core.optional import needed
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.sampling import R2_STEPS
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
 BATCH_POINTS = 1 << 20
 """Points in memory."""

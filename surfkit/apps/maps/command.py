@@ -8,22 +8,22 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.maps.grid import same_crs
-from surfkit.apps.maps.make import MAPS_RECORD, MapSettings, make_maps
-from surfkit.apps.texture.make import MeshWithPhotos
-from surfkit.cli.table import print_table
+from surfkit.apps.maps.make_maps import MAPS_RECORD, MapSettings, make_maps
+from surfkit.apps.maps.map_grid import same_crs
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
+from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.evaluate.geometry.highest import highest
-from surfkit.evaluate.geometry.place import same_plan
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_mesh, read_surface, system_of
+from surfkit.evaluate.geometry.file_transform import same_plan
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_mesh, read_surface, system_of
+from surfkit.evaluate.geometry.top_surface import highest
 from surfkit.runs.command import refuse_no_mesh
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import opened
 from surfkit.runs.resume import read_unchanged
+from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import note_held_out
 from surfkit.scene.scene import Frame
-from surfkit.train.bars import bars
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

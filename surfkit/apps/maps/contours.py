@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.maps.geotiff import TILES_SUFFIX, GeoTiffSettings
-from surfkit.apps.maps.grid import MapGrid, Window
 from surfkit.apps.maps.hillshade import read_heights
+from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing

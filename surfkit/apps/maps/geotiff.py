@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surfkit.apps.maps.grid import MapGrid
-from surfkit.apps.maps.ours import (
+from surfkit.apps.maps.map_grid import MapGrid
+from surfkit.apps.maps.owned_files import (
     NAMES_FILE,
     UNFINISHED_FOLDER,
     claim,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from surfkit.apps.maps.geotiff import GeoTiffSettings
-from surfkit.apps.maps.grid import Window
+from surfkit.apps.maps.map_grid import Window
 from surfkit.apps.maps.rasters import NODATA, window_of
 from surfkit.core.events import Progress, emit
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from surfkit.apps.maps.grid import MapGrid, Window
+from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.core.codec import from_json
 from surfkit.core.files import replacing
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from surfkit.apps.maps.bins import Bins, corners_of, sort_faces
 from surfkit.apps.maps.geotiff import GeoTiffSettings
-from surfkit.apps.maps.grid import MapGrid, Window
-from surfkit.apps.maps.photographs import OrthophotoColors
+from surfkit.apps.maps.map_grid import MapGrid, Window
+from surfkit.apps.maps.orthophoto import OrthophotoColors
 from surfkit.apps.maps.rasters import NODATA
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
 BATCH_CELLS = 1 << 20
 """Cells whose colour is computed at once."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.apps.maps.grid import Window
+from surfkit.apps.maps.map_grid import Window
 
 BATCH_TRIANGLE_CELLS = 1 << 22
 """Pairs of a triangle and a cell in its bounding box in memory."""

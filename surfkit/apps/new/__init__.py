@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.apps.new.names import Names, checked_names
+from surfkit.apps.new.plugin_names import Names, checked_names
 from surfkit.apps.new.write import Template, template_of, write_package
 
 

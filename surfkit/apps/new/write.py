@@ -21,7 +21,7 @@ from surfkit.core.files import replacing_folder
 from surfkit.core.registry import unknown
 
 if TYPE_CHECKING:
-    from surfkit.apps.new.names import Names
+    from surfkit.apps.new.plugin_names import Names
 
 TEMPLATES_FOLDER = Path(__file__).parent / "templates"
 COMMON = TEMPLATES_FOLDER / "common"

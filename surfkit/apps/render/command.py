@@ -10,19 +10,19 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.apps.render.frames import Show, draw_frames, identity
+from surfkit.apps.render.frame_files import Show, draw_frames, identity
 from surfkit.apps.render.path import MAX_FRAMES, MAX_SIDE_PX, CameraPath, flyover, from_file, lens_of, orbit
 from surfkit.apps.render.video import Film, is_video, make_video, require_video
-from surfkit.cli.table import print_table
+from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.raster.select import Device
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import loaded
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene
-from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 SIZE_PATTERN = re.compile(r"(\d{1,5})x(\d{1,5})")
 FPS = 30.0

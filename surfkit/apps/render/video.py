@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from surfkit.apps.render.frames import Show, Tell, draw_frames, tell_all
+from surfkit.apps.render.frame_files import Show, Tell, draw_frames, tell_all
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import sync_folder
 from surfkit.core.lock import locked

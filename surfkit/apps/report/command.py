@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.apps.report.page import DEFAULT_FILE, ReportOptions, write_report
-from surfkit.cli.table import print_table
+from surfkit.apps.report.report_page import DEFAULT_FILE, ReportOptions, write_report
+from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
 from surfkit.core.signals import asking
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 
 T = TypeVar("T")
 INTERRUPT_POLL_S = 0.2

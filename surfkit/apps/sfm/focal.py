@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.engine import load_engine
-from surfkit.apps.sfm.photographs import Photo
+from surfkit.apps.sfm.inspect_photos import Photo
 
 EXIF_FOCAL_SIGMA = 0.03
 """Standard deviation of the focal length of EXIF, as a share: it is rounded, and lenses differ by some percent."""

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import Handedness
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS, SimilarityFit, fit_robustly
+from surfkit.apps.sfm.survey_plausibility import Handedness
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.georeference import Similarity
+from surfkit.io.datasets.topocentric import Similarity
 from surfkit.scene.crs import LATLON_CRS, MAX_UTM_LATITUDE, MAX_UTM_OFFSET_DEGREES, axes_of, exact, parsed, zone_of
 from surfkit.scene.earth import LocalEarthFrame, utm
 

@@ -22,13 +22,13 @@ from surfkit.apps.sfm.georeference import (
     chart_of,
     to_chart,
 )
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import MAX_ALTITUDE_ERROR_M, MAX_POSITION_ERROR_M, MIN_LAND_M, Handedness
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS, PARAMETERS, fit_robustly, umeyama
+from surfkit.apps.sfm.survey_plausibility import MAX_ALTITUDE_ERROR_M, MAX_POSITION_ERROR_M, MIN_LAND_M, Handedness
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.georeference import Similarity
-from surfkit.io.datasets.systems import system_of
+from surfkit.io.datasets.crs_names import system_of
+from surfkit.io.datasets.topocentric import Similarity
 
 MIN_CONTROL_POINTS, MIN_POINT_PHOTOS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""

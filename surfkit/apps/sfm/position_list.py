@@ -13,7 +13,7 @@ import numpy as np
 from surfkit.apps.sfm.exif import MAX_ERROR_M, Position
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.systems import WGS84_DEGREES, System, names_a_system, system_of
+from surfkit.io.datasets.crs_names import WGS84_DEGREES, System, names_a_system, system_of
 
 COLUMN_NAMES = {
     "name": "name label image imagename imagefile photo photograph photoname file filename sourcefile camera "

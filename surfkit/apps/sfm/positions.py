@@ -1,7 +1,8 @@
 """Where photographs were taken, by the best source for each: a list, EXIF, or XMP; what is doubtful is said.
 
 A position without the letters of the hemisphere (N or S, E or W) has no sign. It is that of XMP, or of photographs near
-by that have letters; what is still open has several readings, among which the cameras decide (`surfkit.apps.sfm.site`).
+by that have letters; what is still open has several readings, among which the cameras decide
+(`surfkit.apps.sfm.map_choice`).
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.sfm.exif import Exif, Position
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import MAX_POSITION_ERROR_M, MIN_LAND_M
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.position_list import Listed, read_list
 from surfkit.apps.sfm.settings import Settings
+from surfkit.apps.sfm.survey_plausibility import MAX_POSITION_ERROR_M, MIN_LAND_M
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.scene.earth import geocentric

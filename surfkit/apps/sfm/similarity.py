@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from surfkit.io.datasets.georeference import Similarity
+from surfkit.io.datasets.topocentric import Similarity
 
 TRIPLE_DRAWS, CONCENTRATION_STEPS = 300, 10
 """Fits to three positions; concentrations of each."""

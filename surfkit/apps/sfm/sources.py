@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.frames import ExtractedFrames, take_frames
-from surfkit.apps.sfm.photographs import Photo, files_of, known_photographs, look, look_at
+from surfkit.apps.sfm.inspect_photos import Photo, files_of, known_photographs, look, look_at
 from surfkit.apps.sfm.settings import Settings
+from surfkit.apps.sfm.video_frames import ExtractedFrames, take_frames
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.masks import MASK_SUFFIXES, check_mask, find_masks, read_mask
 from surfkit.io.datasets.masks import MASKS_FOLDER as MASKS
-from surfkit.scene.names import PICTURE_SUFFIXES, is_video
+from surfkit.io.datasets.raw_dataset import RawImage
+from surfkit.scene.photo_names import PICTURE_SUFFIXES, is_video
 from surfkit.scene.scene import Mask
 
 

@@ -15,26 +15,26 @@ from urllib.parse import unquote
 import numpy as np
 import torch
 
-from surfkit.apps.sfm.compare import compare
-from surfkit.apps.sfm.deliver import deliver
-from surfkit.apps.sfm.deliver_masks import deliver_masks
+from surfkit.apps.sfm.dataset_export import deliver
 from surfkit.apps.sfm.engine import load_engine, run
-from surfkit.apps.sfm.features import MIN_FEATURES
+from surfkit.apps.sfm.feature_cache import MIN_FEATURES
+from surfkit.apps.sfm.inspect_photos import PHOTOGRAPHS_FILE, Photo, known_photographs, look_at
 from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, read_model
-from surfkit.apps.sfm.photographs import PHOTOGRAPHS_FILE, Photo, known_photographs, look_at
-from surfkit.apps.sfm.report import model_facts
+from surfkit.apps.sfm.mask_export import deliver_masks
+from surfkit.apps.sfm.match_photos import compare
 from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
+from surfkit.apps.sfm.sfm_report import model_facts
 from surfkit.apps.sfm.sources import Sources, with_masks, with_own_masks
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing_folder
 from surfkit.core.stages import StageFolder, key_of
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.georeference_file import Georeference
 from surfkit.io.datasets.masks import find_masks
 from surfkit.io.datasets.panoramas import ALIGNMENT_HINT
-from surfkit.io.datasets.placed import Georeference
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.read import check_size, read_capture, reader_of
 from surfkit.io.datasets.undistort import check_camera, is_panorama
 from surfkit.scene.photos import photo_size

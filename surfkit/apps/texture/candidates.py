@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.apps.texture.exposure import MAX_USABLE_COLOR, NO_PHOTO, exposed
-from surfkit.apps.texture.look import TriangleVisibility
+from surfkit.apps.texture.photo_gains import MAX_USABLE_COLOR, NO_PHOTO, exposed
+from surfkit.apps.texture.triangle_visibility import TriangleVisibility
 
 MAX_PHOTOS_PER_TRIANGLE = 8
 """Photographs that are remembered for a triangle: those that show it best."""

@@ -8,19 +8,19 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.texture.make import TEXTURE_RECORD, MeshWithPhotos, TextureSettings, make_texture
-from surfkit.cli.table import print_table
+from surfkit.apps.texture.texture_mesh import TEXTURE_RECORD, MeshWithPhotos, TextureSettings, make_texture
+from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import read_mesh
+from surfkit.evaluate.geometry.surface_file import read_mesh
 from surfkit.mesh.simplify import require_simplification
 from surfkit.runs.command import refuse_no_mesh
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import opened
 from surfkit.runs.resume import read_unchanged
+from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import note_held_out
-from surfkit.scene.memory import cache_bytes
-from surfkit.train.bars import bars
+from surfkit.scene.available_memory import cache_bytes
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)

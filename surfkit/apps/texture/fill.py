@@ -11,10 +11,10 @@ from PIL import Image
 from scipy import ndimage
 
 from surfkit.apps.texture.candidates import NO_PHOTO
-from surfkit.apps.texture.charts import PATCH_SIDE, Atlas, AtlasPage
-from surfkit.apps.texture.exposure import exposed, levelled
-from surfkit.apps.texture.level import SeamCorrections
-from surfkit.apps.texture.photographs import PrefetchedPhotos, by_photograph
+from surfkit.apps.texture.photo_gains import exposed, levelled
+from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
+from surfkit.apps.texture.seam_levelling import SeamCorrections
+from surfkit.apps.texture.texture_atlas import PATCH_SIDE, Atlas, AtlasPage
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.scene import Frame, View
 
 SAMPLED_VERTICES = 50_000

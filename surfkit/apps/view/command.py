@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from surfkit.apps.view.page import show
 from surfkit.apps.view.server import LOCAL, Address, refuse_wrong_port, require_viser, served
-from surfkit.apps.view.shelf import DEFAULT_BUDGET, Form
-from surfkit.apps.view.subject import opened_subject
+from surfkit.apps.view.shared_cache import DEFAULT_BUDGET, Form
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import opened_subject
 from surfkit.core.check import BadInput, printable
-from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.raster.select import Device
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 AWAKE_S = 0.2

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surfkit.apps.view.answers import Script, client_in
+from surfkit.apps.view.http_answers import Script, client_in
 
 if TYPE_CHECKING:
     import viser

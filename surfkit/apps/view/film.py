@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import torch
 
-from surfkit.apps.render.frames import Show, identity
+from surfkit.apps.render.frame_files import Show, identity
 from surfkit.apps.render.path import from_file
 from surfkit.apps.render.video import Film, frames_of, make_video, require_video
-from surfkit.apps.view.plain import as_code, as_text
-from surfkit.apps.view.screen import telling
-from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.browser_camera import telling
+from surfkit.apps.view.escape_text import as_code, as_text
+from surfkit.apps.view.shared_cache import SharedCache
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.scene.camera import Camera

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surfkit.apps.view.display import PALETTE
+from surfkit.apps.view.browser_camera import WORLD, CameraFollower, Debouncer, telling
+from surfkit.apps.view.browser_geometry import PALETTE
+from surfkit.apps.view.draw_limits import DrawPace
+from surfkit.apps.view.escape_text import as_text
 from surfkit.apps.view.mesh_layer import MeshLayer
 from surfkit.apps.view.outlines import block_outlines
-from surfkit.apps.view.pace import DrawPace
 from surfkit.apps.view.picking import corners_of
-from surfkit.apps.view.plain import as_text
 from surfkit.apps.view.point_layer import PointLayer
-from surfkit.apps.view.screen import WORLD, CameraFollower, Debouncer, telling
-from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.shared_cache import SharedCache
 from surfkit.apps.view.splat_layer import SplatLayer
 
 if TYPE_CHECKING:

@@ -18,11 +18,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from surfkit.apps.view.browser_camera import WORLD
 from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.cursor import Cursor, serve_cursors
 from surfkit.apps.view.live_page import NO_COORDINATES_NOTE, LivePage, SceneWithoutModel
 from surfkit.apps.view.live_panel import LivePanel
-from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, RunningServer, served
 from surfkit.core.check import BadInput
 from surfkit.core.events import say

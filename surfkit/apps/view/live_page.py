@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import torch
 
-from surfkit.apps.render.frames import view_of
+from surfkit.apps.render.frame_files import view_of
 from surfkit.apps.render.path import beside, middle_of, up_of
+from surfkit.apps.view.browser_camera import WORLD, pose_of, ray_of, stand_at, telling, whole_view
 from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.cursor import Cursor
+from surfkit.apps.view.error_pictures import picture
+from surfkit.apps.view.escape_text import as_text
+from surfkit.apps.view.framed_pictures import FramedPictures, framed, window_of
 from surfkit.apps.view.layers import TRAINED_COLOR, frustum_lines, typical_size
-from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.on_page import FramedPictures, framed, window_of
-from surfkit.apps.view.photographs import TURNING_DISTANCE
+from surfkit.apps.view.measure_clicks import coordinates
+from surfkit.apps.view.photo_comparison import TURNING_DISTANCE
 from surfkit.apps.view.picking import corners_of, hit_camera, surface_depth
-from surfkit.apps.view.pictures import picture
-from surfkit.apps.view.plain import as_text
-from surfkit.apps.view.screen import WORLD, pose_of, ray_of, stand_at, telling, whole_view
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene, View

@@ -11,9 +11,9 @@ import numpy as np
 from PIL import Image
 
 from surfkit.apps.view.control import TrainingControl
-from surfkit.apps.view.follow import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
-from surfkit.apps.view.plain import as_text
-from surfkit.runs.execute.state import BlockState
+from surfkit.apps.view.escape_text import as_text
+from surfkit.apps.view.follow_journal import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
+from surfkit.runs.execute.block_state import BlockState
 from surfkit.train.watch import Watched
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import numpy as np
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.evaluate.geometry.place import FileTransform, place_of, root_of
-from surfkit.evaluate.geometry.surface import SurfaceFile, read_surface
+from surfkit.evaluate.geometry.file_transform import FileTransform, place_of, root_of
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface
 from surfkit.io.glb import UNSIGNED_BYTE
 from surfkit.scene.srgb import from_linear
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING
 
-from surfkit.apps.view.glb import unlit_glb
+from surfkit.apps.view.browser_camera import WORLD, Debouncer, quaternion_of, telling
+from surfkit.apps.view.draw_limits import DrawPace
+from surfkit.apps.view.escape_text import as_text
 from surfkit.apps.view.mesh_files import TexturedGlb
-from surfkit.apps.view.pace import DrawPace
-from surfkit.apps.view.plain import as_text
-from surfkit.apps.view.screen import WORLD, Debouncer, quaternion_of, telling
-from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.shared_cache import SharedCache
 from surfkit.apps.view.splat_layer import add_budget
+from surfkit.apps.view.unlit_glb import unlit_glb
 from surfkit.mesh.base import Mesh
 
 if TYPE_CHECKING:

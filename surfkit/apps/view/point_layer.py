@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surfkit.apps.view.display import some
-from surfkit.apps.view.pace import DrawPace
-from surfkit.apps.view.screen import CameraPose, Debouncer, telling
-from surfkit.apps.view.shelf import MAX_POINT_ENLARGEMENT, SharedCache
+from surfkit.apps.view.browser_camera import CameraPose, Debouncer, telling
+from surfkit.apps.view.browser_geometry import some
+from surfkit.apps.view.draw_limits import DrawPace
+from surfkit.apps.view.shared_cache import MAX_POINT_ENLARGEMENT, SharedCache
 from surfkit.apps.view.splat_layer import add_budget, add_points
-from surfkit.apps.view.subject import ViewerPoints
+from surfkit.apps.view.viewer_scene import ViewerPoints
 
 if TYPE_CHECKING:
     import viser

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from surfkit.apps.view.answers import Script, response
-from surfkit.apps.view.gate import AuthRequest, TokenAuth
+from surfkit.apps.view.http_answers import Script, response
+from surfkit.apps.view.token_auth import AuthRequest, TokenAuth
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.optional import needed
 

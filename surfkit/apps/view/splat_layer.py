@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surfkit.apps.view.by_view import ChosenSplats, in_places
-from surfkit.apps.view.display import Colors
-from surfkit.apps.view.pace import DrawPace
-from surfkit.apps.view.screen import WORLD, CameraPose, Debouncer, telling
-from surfkit.apps.view.shelf import SPLAT_FORMS, Form, SharedCache
+from surfkit.apps.view.browser_camera import WORLD, CameraPose, Debouncer, telling
+from surfkit.apps.view.browser_geometry import Colors
+from surfkit.apps.view.draw_limits import DrawPace
+from surfkit.apps.view.lod_selection import ChosenSplats, in_places
+from surfkit.apps.view.shared_cache import SPLAT_FORMS, Form, SharedCache
 
 if TYPE_CHECKING:
     import viser

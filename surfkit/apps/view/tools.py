@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from surfkit.apps.view.browser_camera import WORLD, pose_of, stand_at, telling
 from surfkit.apps.view.crop_box import edges, sizes, turned_box, upright_axis
+from surfkit.apps.view.escape_text import as_code, as_text
 from surfkit.apps.view.film import FilmTool
 from surfkit.apps.view.keyframes import KeyPath, write_path
 from surfkit.apps.view.layers import frustum_lines
-from surfkit.apps.view.measure import coordinates, in_words, measured, path_lines, shown
+from surfkit.apps.view.measure_clicks import coordinates, in_words, measured, path_lines, shown
 from surfkit.apps.view.picking import corners_of
-from surfkit.apps.view.plain import as_code, as_text
-from surfkit.apps.view.screen import WORLD, pose_of, stand_at, telling
-from surfkit.apps.view.shelf import SharedCache
+from surfkit.apps.view.shared_cache import SharedCache
 from surfkit.core.check import BadInput
 from surfkit.scene.crop import Crop, write_crop
 

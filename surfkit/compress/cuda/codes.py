@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import CudaSource
 
 CODES_SOURCE = CudaSource(Path(__file__).with_name("codes.cu"), is_exact=True)
 TILE_VECTORS = 128

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from surfkit.compress.levels.base import LevelsOfDetail
-from surfkit.compress.levels.merge import MergedLevels
-from surfkit.compress.levels.prune import PrunedLevels
+from surfkit.compress.levels.merged_levels import MergedLevels
+from surfkit.compress.levels.pruned_levels import PrunedLevels
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from surfkit.compress.levels.tree import LodTree
+from surfkit.compress.levels.lod_tree import LodTree
 from surfkit.core.registry import Component
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.model import SplatModel

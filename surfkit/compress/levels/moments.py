@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from surfkit.compress.levels.pairs import MergeCost, summed
+from surfkit.compress.levels.merge_cost import MergeCost, summed
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
 from surfkit.primitives.base import Primitive

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.depth.native import GreyImage, MatchingSettings, Planes, gains, pattern, way
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, gains, pattern, way
 from surfkit.raster.native import module
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import CudaSource
 from surfkit.scene.camera import Camera
 
 BLOCK_WIDTH, BLOCK_HEIGHT = 32, 4

@@ -11,8 +11,8 @@ from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.geometry.classes import Classes, PointClassification
 from surfkit.evaluate.geometry.comparison import ComparisonResult
 from surfkit.evaluate.geometry.errors import PICTURE_LONGEST_PX, draw_from_view, error_colors, write_plan, write_row
+from surfkit.evaluate.geometry.point_visibility import project
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.geometry.visibility import project
 from surfkit.scene.scene import Frame, View
 
 OTHER_COLOR = np.array([232, 232, 232], np.uint8)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from surfkit.evaluate.geometry.comparison import Comparison, ComparisonResult
-from surfkit.evaluate.geometry.normals import normals_at
 from surfkit.evaluate.geometry.repetition import MIN_COMPARED_POINTS, RepetitionResult
 from surfkit.evaluate.geometry.scores import nearest_rows, surface_gap, tree
 from surfkit.evaluate.geometry.sightings import Sightings, sightings
+from surfkit.evaluate.geometry.surface_normals import normals_at
 from surfkit.evaluate.geometry.terrain import Terrain, terrain
 from surfkit.evaluate.geometry.thinning import thin
 from surfkit.evaluate.geometry.transform import apply, scale_of

@@ -26,7 +26,7 @@ from surfkit.evaluate.geometry.repetition import (
     warn_if_sparse,
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, read_transform, scale_of
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
 from surfkit.scene.crop import PLANES, Axis, Crop, read_crop

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from surfkit.core.files import replacing
-from surfkit.evaluate.geometry.visibility import nearest_rows, project, sides
+from surfkit.evaluate.geometry.point_visibility import nearest_rows, project, sides
 from surfkit.io.splats.ply import write_points
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import PLANES, Axis, Crop

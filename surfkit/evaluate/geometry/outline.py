@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.scene.sets import is_among
+from surfkit.scene.set_membership import is_among
 
 RADIUS_CELLS = 8
 """Points closer than a radius over this, or than the extent over the next, are one: the triangulation stays small."""

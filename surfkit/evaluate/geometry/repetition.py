@@ -14,12 +14,12 @@ from surfkit.core.memory import size
 from surfkit.evaluate.geometry.registration import IcpResult, align
 from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
 from surfkit.evaluate.geometry.scores import WORKERS, Distances, nearest, tree
-from surfkit.evaluate.geometry.surface import SurfaceFile, part_within
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, part_within
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
+from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.crop import Crop
-from surfkit.scene.memory import free_bytes
 
 MAX_COMPARED_POINTS = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import BLOCK_POINTS, SurfaceFile
+from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, SurfaceFile
 
 R2_STEPS = np.array([0.7548776662466927, 0.5698402909980532])
 """Of the R2 sequence: 1 / g and 1 / g^2 with g^3 = g + 1. Its points keep their distance however many there are."""

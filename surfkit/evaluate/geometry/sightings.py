@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.visibility import DEPTH_LONGEST_PX, SQUARE_GAPS, cloud_depth, not_hidden, project
+from surfkit.evaluate.geometry.point_visibility import DEPTH_LONGEST_PX, SQUARE_GAPS, cloud_depth, not_hidden, project
 from surfkit.scene.scene import Frame, View
 
 MIN_EDGE_STEP = 0.02

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import Blocks
+from surfkit.evaluate.geometry.surface_file import Blocks
 
 VOXEL_INDEX_BITS = 21
 """Of a voxel's index along each axis, so that all three fit into one integer."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.outline import outline
+from surfkit.evaluate.geometry.point_visibility import visible_counts
 from surfkit.evaluate.geometry.scores import surface_gap, tree
-from surfkit.evaluate.geometry.surface import BLOCK_POINTS, SurfaceFile
+from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.geometry.visibility import visible_counts
 from surfkit.scene.crop import PLANES, Axis, Crop, within
 from surfkit.scene.scene import Frame, View
 

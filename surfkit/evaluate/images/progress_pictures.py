@@ -9,8 +9,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, Measured, PhotoSkipped, emit
-from surfkit.evaluate.images.measure import Draw
-from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
+from surfkit.evaluate.images.comparison_pictures import panel, picture_path, write_picture
+from surfkit.evaluate.images.measure_images import Draw
 from surfkit.raster.psnr import psnr
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import View

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.surface import BLOCK_POINTS
+from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS
 from surfkit.evaluate.mesh.whole import WholeMesh
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from surfkit.evaluate.geometry.sampling import sample_surface
 from surfkit.evaluate.geometry.scores import tree
-from surfkit.evaluate.geometry.surface import part_within
+from surfkit.evaluate.geometry.surface_file import part_within
 from surfkit.evaluate.mesh.boxes import MeshCube, boxes, by_area
 from surfkit.evaluate.mesh.whole import WholeMesh
 

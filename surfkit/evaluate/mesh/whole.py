@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import BLOCK_POINTS, SurfaceFile
+from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, SurfaceFile
 from surfkit.scene.same_places import first_in_place
 
 

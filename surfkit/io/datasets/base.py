@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from surfkit.core.registry import Component
-from surfkit.io.datasets.capture import RawDataset, Tracks
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset, Tracks
 
 
 class Reader(Component):

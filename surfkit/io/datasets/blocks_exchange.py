@@ -29,9 +29,9 @@ from surfkit.io.datasets.camera_files import (
     pose_at,
     tracks_of,
 )
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.exchanged import map_system, photo_names
+from surfkit.io.datasets.exchange_formats import map_system, photo_names
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks
 from surfkit.io.datasets.transforms import points
 
 SNIFFED_BYTES = 4096

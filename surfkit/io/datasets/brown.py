@@ -11,7 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.camera_files import MAX_CAMERA_NUMBER
-from surfkit.io.datasets.capture import camera_of
+from surfkit.io.datasets.raw_dataset import camera_of
 
 GRID_SAMPLES_PER_SIDE = 41
 """Points along each side of the grid on which a camera is compared with the lens."""

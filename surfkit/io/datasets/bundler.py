@@ -26,8 +26,8 @@ from surfkit.io.datasets.camera_files import (
     read_text,
     tracks_of,
 )
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, camera_of
 from surfkit.scene.photos import photo_size
 
 BUNDLE_FILES = ("bundle.out", "bundle/bundle.out")

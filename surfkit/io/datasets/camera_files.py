@@ -12,11 +12,11 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawImage, Tracks, shorten
 from surfkit.io.datasets.undistort import is_panorama
-from surfkit.scene.groups import connect_groups
-from surfkit.scene.names import find_files
+from surfkit.scene.connected_photos import connect_groups
+from surfkit.scene.photo_names import find_files
 
 MAX_CAMERA_NUMBER = 1e30
 """Numbers beyond it are a mistake."""

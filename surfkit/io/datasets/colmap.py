@@ -13,12 +13,12 @@ import numpy as np
 from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, load_pycolmap
 from surfkit.io.datasets.colmap_files import MIN_ENTRY_BYTES, cut_off, refuse_cut_off
 from surfkit.io.datasets.data import Data, nearest
-from surfkit.io.datasets.placed import Georeference, on_the_map, read_placed
-from surfkit.scene.groups import connect_groups
-from surfkit.scene.names import find_files
+from surfkit.io.datasets.georeference_file import Georeference, on_the_map, read_placed
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, load_pycolmap
+from surfkit.scene.connected_photos import connect_groups
+from surfkit.scene.photo_names import find_files
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a model may lie, the first that is there wins."""

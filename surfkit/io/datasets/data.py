@@ -13,8 +13,8 @@ import tyro
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, name_of
-from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.depth_layout import DepthLayout
+from surfkit.io.datasets.raw_dataset import RawDataset
 from surfkit.io.datasets.split import Split
 from surfkit.scene.pixels import Alpha
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.depth_files import DepthFile
+from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.scene.photos import read_photo
 
 MAX_CLOUD_SHOTS = 200

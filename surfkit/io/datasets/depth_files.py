@@ -15,7 +15,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
 from surfkit.scene.arrays import map_array, write_array
-from surfkit.scene.names import safe_path
+from surfkit.scene.photo_names import safe_path
 from surfkit.scene.photos import open_picture
 
 EXR = ".exr"

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, EXR, DepthFile, map_path, read_record
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
-from surfkit.scene.names import name_below, named_file, safe_path
+from surfkit.scene.photo_names import name_below, named_file, safe_path
 
 MILLIMETRE = 1e-3
 """Nerfstudio's `depth_unit_scale_factor`, where a data set does not say another."""

@@ -19,9 +19,9 @@ from surfkit.io.datasets.depth_files import DepthFile, normal_path, read_record
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_layouts import EstimatedDepths
 from surfkit.io.datasets.depth_lens import fits_both, has_shape, judge, lens_in
+from surfkit.io.datasets.depth_map_index import located
 from surfkit.io.datasets.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
 from surfkit.io.datasets.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
-from surfkit.io.datasets.made_maps import located
 from surfkit.io.datasets.panoramas import has_panoramas, points_remedy
 from surfkit.io.datasets.read import model_folder, observations
 from surfkit.scene.align import MAX_ERROR_PX, SCALE_BAND, align, sample

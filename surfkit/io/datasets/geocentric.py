@@ -11,7 +11,7 @@ from pyproj.exceptions import ProjError
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.georeference import Similarity
+from surfkit.io.datasets.topocentric import Similarity
 from surfkit.scene.crs import MAX_UTM_LATITUDE, code_in, exact, from_wkt, in_plan, zone_of
 from surfkit.scene.earth import FLATTENING, SEMI_MAJOR_AXIS_M, to_ecef, utm
 

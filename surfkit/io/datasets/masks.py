@@ -15,8 +15,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.io.datasets.capture import RawImage
-from surfkit.io.datasets.pixels import PixelInterpretation
+from surfkit.io.datasets.pixel_interpretation import PixelInterpretation
+from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.scene.cache import Cache
 from surfkit.scene.photos import open_header, open_picture, photo_size
 from surfkit.scene.pixels import has_opacity, opacity_of

@@ -20,11 +20,11 @@ from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import leave_out, numbers, one_file, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.geocentric import place_of
-from surfkit.io.datasets.georeference import Similarity
 from surfkit.io.datasets.panoramas import panorama
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
+from surfkit.io.datasets.topocentric import Similarity
 from surfkit.io.datasets.transforms import points
 
 SNIFFED_BYTES = 4096

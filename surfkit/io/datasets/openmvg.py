@@ -26,8 +26,8 @@ from surfkit.io.datasets.camera_files import (
     pose_at,
     tracks_of,
 )
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, shorten
 
 SFM_DATA_FILES = (
     "sfm_data.json",

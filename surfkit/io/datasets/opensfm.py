@@ -15,12 +15,12 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.camera_files import MAX_CAMERA_NUMBER, read_lines, tracks_of
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.geocentric import topocentric_to_utm, warn_of_bend
-from surfkit.io.datasets.georeference import place_on_earth
 from surfkit.io.datasets.panoramas import panorama
-from surfkit.scene.names import find_files
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, camera_of
+from surfkit.io.datasets.topocentric import place_on_earth
+from surfkit.scene.photo_names import find_files
 
 RECONSTRUCTION_FILES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
 """Where the reconstruction may lie, the first that is there wins. OpenDroneMap puts one on the map in the place of the

@@ -23,10 +23,10 @@ from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import groups_of, leave_out, numbers, one_file, photographs, pose_at, tracks_of
-from surfkit.io.datasets.capture import RawDataset, RawImage, Tracks, shorten
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.exchanged import map_system, photo_names
+from surfkit.io.datasets.exchange_formats import map_system, photo_names
 from surfkit.io.datasets.opf_points import OpfPoints, read_opf_points
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, shorten
 from surfkit.io.datasets.transforms import points
 
 FORMAT_PATTERN = "application/opf-{}+json"

@@ -19,7 +19,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.io.datasets.camera_files import numbers
-from surfkit.io.datasets.capture import shorten
+from surfkit.io.datasets.raw_dataset import shorten
 from surfkit.io.glb import ACCESSOR_WIDTHS
 from surfkit.scene.rotations import numpy_rotations
 

@@ -21,9 +21,9 @@ from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import RawImage, Tracks, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import empty_masks, read_mask
+from surfkit.io.datasets.raw_dataset import RawImage, Tracks, camera_of
 from surfkit.io.datasets.undistort import (
     PANORAMA_MODEL,
     DistortedPhoto,
@@ -33,8 +33,8 @@ from surfkit.io.datasets.undistort import (
     save_mask,
     save_picture,
 )
-from surfkit.scene.copies import digest, place
-from surfkit.scene.gate import ByteSemaphore
+from surfkit.scene.byte_semaphore import ByteSemaphore
+from surfkit.scene.decoded_photos import digest, place
 from surfkit.scene.pixels import DEFAULT_PIXELS
 from surfkit.scene.scene import Mask
 

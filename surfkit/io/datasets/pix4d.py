@@ -18,8 +18,8 @@ from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, one_file, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.transforms import points
 from surfkit.scene.crs import code_in, from_wkt, in_plan, metres_of
 

@@ -20,11 +20,11 @@ from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, photographs, pose_at
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
 from surfkit.io.datasets.depth_layouts import MILLIMETRE
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.transforms import points
 
 KEYFRAMES = "keyframes"

@@ -17,10 +17,10 @@ from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit, reading_again
 from surfkit.core.registry import components, find, name_of
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.colmap import COLMAP, MODEL_FOLDERS
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
+from surfkit.io.datasets.georeference_file import GEOREFERENCE_FILE, Georeference, on_the_map, read_placed
 from surfkit.io.datasets.masks import check_mask, find_masks, with_opacity
 from surfkit.io.datasets.panoramas import (
     CUBE_FACES,
@@ -35,8 +35,8 @@ from surfkit.io.datasets.panoramas import (
     view_sizes,
     views_of,
 )
-from surfkit.io.datasets.pixels import PixelInterpretation, decide
-from surfkit.io.datasets.placed import GEOREFERENCE_FILE, Georeference, on_the_map, read_placed
+from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.record3d import PACKED_SUFFIX
 from surfkit.io.datasets.reduced import reduced
 from surfkit.io.datasets.undistort import (
@@ -49,11 +49,11 @@ from surfkit.io.datasets.undistort import (
     undistort,
 )
 from surfkit.scene.camera import Camera
-from surfkit.scene.copies import place
+from surfkit.scene.connected_photos import groups_warning, untied_warning
 from surfkit.scene.crs import known_axes, refuse_other_unit
-from surfkit.scene.groups import groups_warning, untied_warning
-from surfkit.scene.names import PICTURE_SUFFIXES, VIDEO_SUFFIXES, is_video
+from surfkit.scene.decoded_photos import place
 from surfkit.scene.observations import Observations, Observations2D
+from surfkit.scene.photo_names import PICTURE_SUFFIXES, VIDEO_SUFFIXES, is_video
 from surfkit.scene.photos import is_turned, photo_size, refuse_large
 from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 

@@ -18,9 +18,9 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.camera_files import numbers, photographs, pose_at
-from surfkit.io.datasets.capture import RawDataset, RawImage, camera_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.polycam import OPENGL_TO_OPENCV, WORLD_TO_Z_UP
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, camera_of
 from surfkit.io.datasets.transforms import points
 
 METADATA_FILES = ("metadata", "metadata.json")

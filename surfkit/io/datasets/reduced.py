@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.capture import RawImage
 from surfkit.io.datasets.data import Data
-from surfkit.scene.names import find_files
+from surfkit.io.datasets.raw_dataset import RawImage
+from surfkit.scene.photo_names import find_files
 from surfkit.scene.photos import photo_size
 
 IMAGES_FOLDER = "images"

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
-from surfkit.io.datasets.capture import RawDataset
+from surfkit.io.datasets.raw_dataset import RawDataset
 
 
 class Split(Component):

@@ -15,15 +15,15 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset, RawImage, camera_of, shorten
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_cloud import sample_depth_maps
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_layouts import MatrixCityDepths
 from surfkit.io.datasets.panoramas import panorama
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, camera_of, shorten
 from surfkit.io.datasets.sparse_ply import read_points
 from surfkit.io.datasets.undistort import PANORAMA_MODEL
-from surfkit.scene.names import name_below, named_file
+from surfkit.scene.photo_names import name_below, named_file
 from surfkit.scene.photos import photo_size
 
 TRIED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")

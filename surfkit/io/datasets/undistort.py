@@ -15,9 +15,9 @@ from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
-from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.masks import read_mask
-from surfkit.scene.copies import digest, place
+from surfkit.io.datasets.raw_dataset import load_pycolmap
+from surfkit.scene.decoded_photos import digest, place
 from surfkit.scene.photos import read_photo
 from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Lens, Mask

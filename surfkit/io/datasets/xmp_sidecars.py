@@ -22,11 +22,11 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import leave_out, numbers, photographs, pose_at, read_text
-from surfkit.io.datasets.capture import RawDataset, RawImage
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.realitycapture import FILM_MM
 from surfkit.io.datasets.transforms import points
-from surfkit.scene.names import PICTURE_SUFFIXES
+from surfkit.scene.photo_names import PICTURE_SUFFIXES
 from surfkit.scene.photos import photo_size
 
 SPACE = "http://www.capturingreality.com/ns/xcr/"

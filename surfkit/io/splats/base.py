@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component, name_of
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
 SNIFFED_BYTES = 4096

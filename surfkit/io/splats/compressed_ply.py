@@ -24,7 +24,7 @@ from surfkit.core.version import own_version
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import SH_C0, from_smallest_three, logits, outlying_order, sigmoid, smallest_three
 from surfkit.io.splats.ply import Elements, mode_of, read_elements, shifted
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 

@@ -21,13 +21,13 @@ import torch
 
 from surfkit.core.version import own_version
 from surfkit.io.glb import FLOAT, GLB_MAGIC, UNSIGNED_BYTE, VERTICES, GlbWriter, write_glb
-from surfkit.io.splats.axes import turn_between
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import SH_C0, to_bytes
+from surfkit.io.splats.file_axes import turn_between
 from surfkit.io.splats.gltf_reader import COMPRESSED, MIN_NORMAL_FLOAT32, SPLATS, UPS, harmonics, read_splats
+from surfkit.io.splats.rotate_splats import turned
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.spz import SPZ, spz_bytes, spz_table
-from surfkit.io.splats.table import SplatTable, Tile
-from surfkit.io.splats.turn import turned
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import MAX_EXTENTS_OFFSET, Frame
 

@@ -15,10 +15,10 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.io.glb import UNLIT, GltfDocument, read_glb
-from surfkit.io.splats.axes import Axes, FileAxes, turn_between
+from surfkit.io.splats.file_axes import Axes, FileAxes, turn_between
+from surfkit.io.splats.rotate_splats import parts_of, turned
+from surfkit.io.splats.splat_table import SPLAT_COLUMNS, SplatTable
 from surfkit.io.splats.spz import SPZ_ROUNDING, spz_table
-from surfkit.io.splats.table import SPLAT_COLUMNS, SplatTable
-from surfkit.io.splats.turn import parts_of, turned
 from surfkit.scene.rotations import numpy_rotations
 
 SPLATS = "KHR_gaussian_splatting"

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.splats.files import format_of
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_files import format_of
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.scene.scene import Frame, Scene, View
 
 MAX_SEARCHED_VIEWS = 64

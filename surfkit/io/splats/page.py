@@ -22,9 +22,9 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.io.splats.base import Format
+from surfkit.io.splats.rotate_splats import turned
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.spz import SPZ, spz_bytes
-from surfkit.io.splats.table import SplatTable, Tile
-from surfkit.io.splats.turn import turned
 from surfkit.scene.scene import Frame, View
 
 EXTENT_SPLAT_SHARE = 0.9

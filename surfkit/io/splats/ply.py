@@ -16,7 +16,7 @@ from surfkit.core.check import BadInput, expect
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
 WRITTEN_ROWS = 1 << 16

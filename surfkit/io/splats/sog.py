@@ -29,7 +29,7 @@ from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import sigmoid, smallest_three, to_bytes
 from surfkit.io.splats.palette import codebook, nearest, palette
 from surfkit.io.splats.sog_reader import is_sog, read_sog
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.scene.morton import morton_order
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame

@@ -20,8 +20,8 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json
 from surfkit.io.splats.bits import from_smallest_three, logits
-from surfkit.io.splats.table import SplatTable
-from surfkit.io.splats.unpack import ALWAYS_ALLOWED_BYTES, refuse_implausible
+from surfkit.io.splats.safe_decompress import ALWAYS_ALLOWED_BYTES, refuse_implausible
+from surfkit.io.splats.splat_table import SplatTable
 
 MAX_WEBP_SIDE = 16_383
 """Most pixels of a WebP image along a side."""

@@ -18,7 +18,7 @@ from surfkit.core.files import replacing
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import SH_C0, logits, sigmoid, to_bytes
 from surfkit.io.splats.ply import WRITTEN_ROWS
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame
 

@@ -26,10 +26,12 @@ from torch import Tensor
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
-from surfkit.io.splats.axes import AXES_NAMES, PLY_AXES, FileAxes, turn_between
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.bits import sigmoid, smallest_three, to_bytes
+from surfkit.io.splats.file_axes import AXES_NAMES, PLY_AXES, FileAxes, turn_between
 from surfkit.io.splats.ply import WRITTEN_ROWS
+from surfkit.io.splats.rotate_splats import turned
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.spz_reader import (
     AXES_RECORD,
     COLOR_SCALE,
@@ -41,8 +43,6 @@ from surfkit.io.splats.spz_reader import (
     SPZ_MAGIC,
     decoded,
 )
-from surfkit.io.splats.table import SplatTable, Tile
-from surfkit.io.splats.turn import turned
 from surfkit.scene.morton import morton_order
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import Frame

@@ -11,10 +11,10 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.io.splats.axes import AXES_NAMES, Axes
 from surfkit.io.splats.bits import from_smallest_three, logits
-from surfkit.io.splats.table import SplatTable
-from surfkit.io.splats.unpack import inflated, unpacked_zstd
+from surfkit.io.splats.file_axes import AXES_NAMES, Axes
+from surfkit.io.splats.safe_decompress import inflated, unpacked_zstd
+from surfkit.io.splats.splat_table import SplatTable
 
 SPZ_MAGIC = b"NGSP"
 COLOR_SCALE = 0.15

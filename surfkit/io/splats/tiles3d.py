@@ -21,8 +21,8 @@ from surfkit.core.files import refuse_own, replacing_folder
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.gltf import Compress, Up, extensions_of, up_of, write_splats
 from surfkit.io.splats.gltf_reader import UPS, read_splats
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.spz import SPZ
-from surfkit.io.splats.table import SplatTable, Tile
 from surfkit.io.splats.tileset import INDEX, box_json, ground_of, tileset
 from surfkit.scene.rotations import numpy_rotations
 from surfkit.scene.scene import Frame

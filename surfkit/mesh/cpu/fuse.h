@@ -1,5 +1,5 @@
 // The state of voxels and what one view does to a block of them; one compilation for each instruction set.
-// The definition of correct is surfkit/mesh/reference.py: every step here is rounded as it is there, to the same bits.
+// The definition of correct is surfkit/mesh/reference_grid.py: every step here is rounded as it is there, to the same bits.
 #pragma once
 
 #include <cstdint>

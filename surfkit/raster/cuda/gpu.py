@@ -10,10 +10,10 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.driver import driver
 from surfkit.raster.nvrtc.modules import Kernels, kernels
 from surfkit.raster.nvrtc.nvrtc import nvrtc
-from surfkit.raster.nvrtc.source import CudaSource
 
 
 @dataclass(frozen=True)

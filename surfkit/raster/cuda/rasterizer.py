@@ -19,9 +19,9 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.culling import may_touch
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
-from surfkit.raster.nvrtc.source import CudaSource
-from surfkit.raster.outlook import may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 

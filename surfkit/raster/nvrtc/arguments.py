@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.raster.nvrtc.source import SCALAR_TYPES, CudaSource, Kernel, Parameter
+from surfkit.raster.nvrtc.cuda_source import SCALAR_TYPES, CudaSource, Kernel, Parameter
 
 Size = int | Sequence[int]
 """Of a grid or block: x, or (x, y), or (x, y, z)."""

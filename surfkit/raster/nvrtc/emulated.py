@@ -19,7 +19,7 @@ import torch
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc.arguments import BufferArgument, Size, signatures
-from surfkit.raster.nvrtc.source import CUDA_FOLDER, CudaSource, Kernel
+from surfkit.raster.nvrtc.cuda_source import CUDA_FOLDER, CudaSource, Kernel
 
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-w")
 """Hidden, because libraries of several sources, each with its own machine, are loaded into one process."""

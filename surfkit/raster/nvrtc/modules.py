@@ -8,10 +8,10 @@ from typing import Any, Protocol
 import torch
 
 from surfkit.raster.nvrtc.arguments import Size, signatures
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.driver import Driver, driver
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.nvrtc.nvrtc import image, nvrtc
-from surfkit.raster.nvrtc.source import CudaSource
 
 
 class Kernels(Protocol):

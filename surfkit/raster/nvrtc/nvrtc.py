@@ -20,7 +20,7 @@ import torch
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
-from surfkit.raster.nvrtc.source import CudaSource
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 
 COMPILER_OPTIONS = ("--std=c++17", "--device-as-default-execution-space", "--ptxas-options=-v")
 SEPARATE_ROUNDING_OPTION = "--fmad=false"

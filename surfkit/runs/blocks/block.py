@@ -12,7 +12,7 @@ from surfkit.core.codec import read_json
 from surfkit.losses.consensus import Consensus
 from surfkit.partition.plan import BlockPlan as PlannedBlock
 from surfkit.partition.plan import PartitionPlan
-from surfkit.runs.execute.state import BlockState, read_state, write_state
+from surfkit.runs.execute.block_state import BlockState, read_state, write_state
 from surfkit.runs.folder import Run, RunStage
 from surfkit.runs.recipe import Recipe
 

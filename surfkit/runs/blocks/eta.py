@@ -12,7 +12,7 @@ MIN_MEASURED_S = 3.0
 
 
 class TimedBlock(Protocol):
-    """The fields of `surfkit.runs.execute.state.BlockState` that are needed."""
+    """The fields of `surfkit.runs.execute.block_state.BlockState` that are needed."""
 
     status: str
     step: int

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from surfkit.core.events import Warned, emit
 from surfkit.densify.base import Densify
 from surfkit.runs.blocks.block import BlockRun
-from surfkit.runs.execute.state import BlockState
+from surfkit.runs.execute.block_state import BlockState
 from surfkit.runs.folder import RunStage
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings

@@ -14,7 +14,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.files import replacing
-from surfkit.partition.consensus import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
+from surfkit.partition.admm import ConsensusState, PointCopies, agree, columns_after, common, mean_copies
 from surfkit.partition.merge import BlockContribution
 from surfkit.primitives.points import Columns
 from surfkit.runs.blocks.block import BlockRun, agreement_file, consensus_of, rounds_agreed

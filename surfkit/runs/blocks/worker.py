@@ -31,12 +31,12 @@ from surfkit.runs.blocks.oom_retry import apply_fallback, take_fallback
 from surfkit.runs.blocks.rounds import ID, stops, take_in
 from surfkit.runs.command import train_command
 from surfkit.runs.context import RunContext
+from surfkit.runs.execute.block_state import STALE_S, find_remote_worker, find_worker
 from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, DRIVER, INTERRUPTED_STATUS
-from surfkit.runs.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.runs.folder import Run, refuse_file
 from surfkit.runs.journal import record_events
-from surfkit.runs.notes import prefix_notes
-from surfkit.runs.stage import StageJob, load_state, optimise
+from surfkit.runs.run_notes import prefix_notes
+from surfkit.runs.run_stage import StageJob, load_state, optimise
 from surfkit.scene.scene import View
 from surfkit.start.base import InitialModel
 from surfkit.train.data_cache import read_ahead

@@ -16,9 +16,9 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.core.signals import terminable
+from surfkit.runs.execute.block_state import Kind
 from surfkit.runs.execute.remote import CHILD_POLL_S, DRIVER, INTERRUPTED_STATUS
-from surfkit.runs.execute.state import Kind
-from surfkit.scene.memory import free_bytes, oom_kills
+from surfkit.scene.available_memory import free_bytes, oom_kills
 
 LOG = "log.txt"
 """Output of a worker process, in the folder of its job."""

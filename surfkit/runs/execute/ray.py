@@ -14,9 +14,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.core.signals import terminable
 from surfkit.runs.execute.base import Executor, Job, JobResult, sort_by_cost
+from surfkit.runs.execute.block_state import Kind
 from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, run_remote_job
-from surfkit.runs.execute.shared import mark_folder, remote_job
-from surfkit.runs.execute.state import Kind
+from surfkit.runs.execute.shared_filesystem import mark_folder, remote_job
 
 REACH_S = 10.0
 AGAIN_S = 2.0

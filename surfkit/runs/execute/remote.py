@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from surfkit.core.version import own_version
-from surfkit.scene.memory import oom_kills
+from surfkit.scene.available_memory import oom_kills
 
 DRIVER = "SURFKIT_DRIVER"
 """Environment variable with the process that started a worker; when that process is gone, the worker stops."""

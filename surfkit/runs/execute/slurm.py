@@ -22,9 +22,9 @@ from surfkit.core.events import say
 from surfkit.core.optional import needed
 from surfkit.core.signals import terminable
 from surfkit.runs.execute.base import Executor, Job, JobResult, sort_by_cost
+from surfkit.runs.execute.block_state import Kind, find_worker
 from surfkit.runs.execute.remote import CHILD_POLL_S, CRASHED_STATUS, RemoteJob
-from surfkit.runs.execute.shared import mark_folder, remote_job
-from surfkit.runs.execute.state import Kind, find_worker
+from surfkit.runs.execute.shared_filesystem import mark_folder, remote_job
 
 SLURM_POLL_S = 1.0
 SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T %r")

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.runs.methods.imported import SplatImport
-from surfkit.runs.methods.splats import SplatOptimisation
-from surfkit.runs.methods.stereo import StereoFusion
+from surfkit.runs.methods.splat_optimisation import SplatOptimisation
+from surfkit.runs.methods.stereo_fusion import StereoFusion
 
 
 @hookimpl

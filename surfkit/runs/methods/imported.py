@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from surfkit.io.splats.axes import AxesOrAuto
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model, model_file, read_sound, warn_of_no_fit
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
-from surfkit.start.axes import read_in_scene
+from surfkit.start.guess_axes import read_in_scene
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.methods.imported import SplatImport
 from surfkit.runs.recipe import Recipe
 from surfkit.study.recipes import city, city_datasets
-from surfkit.study.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS, SURFACE_SHORT
-from surfkit.train.refine.light import DistilSH, PruneAndRecover, slowing
+from surfkit.study.recipes.surface_recipes import STEREO, SURFACE, SURFACE_BLOCKS, SURFACE_SHORT
+from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover, slowing
 from surfkit.train.stage import Stage
 
 GAUSSIANS = Recipe(

@@ -21,7 +21,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
 from surfkit.losses.warped_patches import WarpedPatches
-from surfkit.mesh.agreement import GeometricConsistency
+from surfkit.mesh.geometric_consistency import GeometricConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import SSIMDifference
@@ -32,11 +32,12 @@ from surfkit.partition.sparse_points import SparsePointShare
 from surfkit.partition.square_grid import SquareGrid
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.recipe import Recipe
-from surfkit.start.stereo import StereoStart
+from surfkit.start.stereo_start import StereoStart
 from surfkit.study.ablation import BASELINE, Row, Table
-from surfkit.study.columns import MESH_COLUMNS
-from surfkit.study.recipes import RECIPES, city, surface
-from surfkit.study.recipes.surface import STEREO
+from surfkit.study.metric_columns import MESH_COLUMNS
+from surfkit.study.recipes import RECIPES, city
+from surfkit.study.recipes import surface_recipes as surface
+from surfkit.study.recipes.surface_recipes import STEREO
 from surfkit.train.stage import Stage
 
 COARSE_BASELINE = Recipe(

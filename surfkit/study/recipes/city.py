@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from surfkit.compress.levels.prune import PrunedLevels
+from surfkit.compress.levels.pruned_levels import PrunedLevels
 from surfkit.compress.vectree import Vectree
 from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
@@ -20,7 +20,7 @@ from surfkit.primitives.columns import RATES
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.recipe import Recipe
-from surfkit.train.refine.light import DistilSH, PruneAndRecover
+from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover
 from surfkit.train.stage import Stage
 
 ELONGATION_FILTERS = (Elongation(min_ratio=0.01),)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.train.refine.base import Refine
-from surfkit.train.refine.light import DistilSH, PruneAndRecover
+from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover
 
 
 @hookimpl

@@ -16,9 +16,9 @@ from surfkit.core.codec import dump
 from surfkit.core.tree import evolve
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import write_map
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.losses import NormalPrior
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

@@ -39,7 +39,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.runs.pipeline import Intervals, run, with_steps
 from surfkit.scene.scene import SparsePoints
-from surfkit.study.recipes.surface import SURFACE
+from surfkit.study.recipes.surface_recipes import SURFACE
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.trainer import Trainer

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surfkit.apps.doctor.exposure import exposures, luminance
+from surfkit.apps.doctor.coverage_gaps import holes
+from surfkit.apps.doctor.exposure_spread import exposures, luminance
 from surfkit.apps.doctor.geometry import places
-from surfkit.apps.doctor.holes import holes
-from surfkit.io.datasets.capture import RawImage, load_pycolmap
+from surfkit.io.datasets.raw_dataset import RawImage, load_pycolmap
 
 
 def shot(model, *params):

@@ -11,8 +11,8 @@ from surfkit.apps.doctor.examine import examine
 from surfkit.cli.recipes import recipes
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
-from surfkit.scene import large
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene import large_photos as large
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 

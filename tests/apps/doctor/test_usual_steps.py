@@ -5,15 +5,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from surfkit.apps.doctor import usual_steps as length
-from surfkit.apps.result import what_next
+from surfkit.apps.doctor import default_steps as length
+from surfkit.apps.run_summary import what_next
 from surfkit.cli.recipes import ARGV
 from surfkit.core.codec import dump
 from surfkit.io.datasets.data import Data
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import with_steps
 from surfkit.runs.recipe import Recipe
-from surfkit.study.recipes.surface import SURFACE, SURFACE_SHORT
+from surfkit.study.recipes.surface_recipes import SURFACE, SURFACE_SHORT
 
 WHOLE = 30_000
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from surfkit.apps.maps.grid import MapGrid, Window
+from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.zbuffer import ZBuffer
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
 UTM = (451_234.0, 5_873_211.0)
 

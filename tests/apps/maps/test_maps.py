@@ -11,12 +11,12 @@ from forks import started
 from interrupted import digests, kill_at
 from needs import needs, needs_native
 
-from surfkit.apps.texture.files import AtlasPageMesh, write_obj
+from surfkit.apps.texture.obj_glb import AtlasPageMesh, write_obj
 from surfkit.cli import main
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 rasterio = needs("rasterio")

@@ -8,9 +8,9 @@ from needs import needs
 from PIL import Image
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
-from surfkit.apps.maps.make import MapSettings, make_maps
-from surfkit.apps.maps.photographs import between
-from surfkit.apps.texture.make import MeshWithPhotos
+from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.orthophoto import between
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 
 rasterio = needs("rasterio")
 needs("fast_simplification")

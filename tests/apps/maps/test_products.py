@@ -13,13 +13,13 @@ from surfkit.apps.maps.cloud import sample_evenly, write_cloud
 from surfkit.apps.maps.contours import contour_lines, even_interval
 from surfkit.apps.maps.difference import write_difference
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
-from surfkit.apps.maps.grid import Window, map_crs, same_crs
 from surfkit.apps.maps.hillshade import hillshade
-from surfkit.apps.maps.make import MapSettings, make_maps
-from surfkit.apps.texture.make import MeshWithPhotos
+from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.map_grid import Window, map_crs, same_crs
 from surfkit.apps.texture.resolution import ground_sampling_distance
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
@@ -239,7 +239,7 @@ def test_a_system_that_would_make_volumes_wrong_is_refused(tmp_path, crs, metres
 
 def test_lengths_that_a_map_stretches_a_little_are_told_of(tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr("surfkit.apps.maps.grid.emit", told.append)
+    monkeypatch.setattr("surfkit.apps.maps.map_grid.emit", told.append)
     place = (2_000_000.0, 2_000_000.0)  # 64 degrees north
     for crs, at in (("EPSG:3035", (4_321_000.0, 3_210_000.0)), ("EPSG:3995", place)):
         map_crs(Frame(np.array([*at, 0.0]), 0.01, 1.0, crs))

@@ -10,10 +10,10 @@ from needs import needs
 from town import town
 
 from surfkit.apps.maps import contours, surface_model
-from surfkit.apps.maps import make as making
-from surfkit.apps.maps.make import MapSettings, MeshWithPhotos, make_maps
-from surfkit.apps.maps.ours import NAMES_FILE, UNFINISHED_FOLDER
-from surfkit.apps.texture import make as texturing
+from surfkit.apps.maps import make_maps as making
+from surfkit.apps.maps.make_maps import MapSettings, MeshWithPhotos, make_maps
+from surfkit.apps.maps.owned_files import NAMES_FILE, UNFINISHED_FOLDER
+from surfkit.apps.texture import texture_mesh as texturing
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.scene.scene import Frame

@@ -5,12 +5,12 @@ import pytest
 from needs import needs
 
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
-from surfkit.apps.maps.grid import MapGrid, map_crs
+from surfkit.apps.maps.map_grid import MapGrid, map_crs
 from surfkit.apps.maps.rasters import NODATA
 from surfkit.apps.maps.surface_model import draw_surface, needs_double
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.scene.earth import geocentric, to_ecef
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes

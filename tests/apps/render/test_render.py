@@ -13,7 +13,7 @@ import torch
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.render.frames import FRAMES_RECORD, draw_frames, identity, shown
+from surfkit.apps.render.frame_files import FRAMES_RECORD, draw_frames, identity, shown
 from surfkit.apps.render.path import flyover, from_file, lens_of, middle_of, orbit, posed, through
 from surfkit.apps.render.video import write_video
 from surfkit.cli import main

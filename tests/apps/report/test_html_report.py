@@ -13,7 +13,7 @@ from PIL import Image
 
 from surfkit.apps.report import gallery
 from surfkit.apps.report.elements import EmbeddedPicture
-from surfkit.apps.report.page import ReportOptions, html, page_of
+from surfkit.apps.report.report_page import ReportOptions, html, page_of
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 
@@ -242,7 +242,7 @@ def test_a_run_that_has_hardly_begun(tmp_path):
 
 def test_values_of_a_wrong_kind_are_left_out(run, monkeypatch):
     """Whatever stands in the place of a value, the page is made."""
-    monkeypatch.setattr("surfkit.apps.report.charts._drawing", lambda *_: "")
+    monkeypatch.setattr("surfkit.apps.report.svg_charts._drawing", lambda *_: "")
     for name in ("run.json", "metrics.json", "mesh.json", "compressed/compressed.json", "blocks/plan.json"):
         whole = (run / name).read_text()
         for odd in (None, "x", [1, [2]], {"a": {"b": []}}, -1e308):

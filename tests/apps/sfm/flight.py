@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.photographs import Photo
+from surfkit.apps.sfm.inspect_photos import Photo
 
 WIDTH, HEIGHT, FOCAL, ALTITUDE = 320, 240, 222.0, 60.0
 NOISE_PX = 0.3

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 
 
 def reconstruction(poses, points, turn, scale, move, camera=None):

@@ -81,7 +81,7 @@ def test_sigterm_does_what_it_did_before_pycolmap_was_loaded(before, code):
     program = f"""
 import os, signal, sys, time
 {before}
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 load_pycolmap()
 os.kill(os.getpid(), signal.SIGTERM)
 time.sleep(1)

@@ -10,7 +10,7 @@ from PIL.TiffImagePlugin import IFDRational
 from surfkit.apps.sfm import exif
 from surfkit.apps.sfm.exif import Exif, facts, read_exif
 from surfkit.apps.sfm.xmp import read_xmp
-from surfkit.testing.exif import write_exif
+from surfkit.testing.write_exif import write_exif
 
 DJI = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatitude="+52.1" drone-dji:RtkFlag="50"
  drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.011" drone-dji:RtkStdHgt="0.025"/></x:xmpmeta>"""

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surfkit.apps.sfm.adjust import adjust
+from surfkit.apps.sfm.bundle_adjustment import adjust
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import Focal, height_stretch, weighed
+from surfkit.apps.sfm.map_choice import readings
 from surfkit.apps.sfm.positions import Positions
-from surfkit.apps.sfm.prepare import SfmPreparation
 from surfkit.apps.sfm.settings import Settings
-from surfkit.apps.sfm.site import readings
-from surfkit.runs.notes import collect_notes
+from surfkit.apps.sfm.sfm_pipeline import SfmPreparation
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm
 
 from .flight import ALTITUDE, FOCAL, fly, reconstructed

@@ -10,13 +10,13 @@ import pytest
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.sfm import frames
-from surfkit.apps.sfm.frames import Track, choose, take_frames
+from surfkit.apps.sfm import video_frames as frames
+from surfkit.apps.sfm.video_frames import Track, choose, take_frames
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import bare_photographs, read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 from .pictures import HEIGHT, WIDTH, arc, looking, picture, save
 

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.georeference import MapProjection, NoSimilarity, Placement, chart_of, place, to_chart
-from surfkit.apps.sfm.photographs import Photo
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.core.check import BadInput
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm
 
 EAST, NORTH = 372_000.0, 5_810_000.0

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.georeference import NoSimilarity
 from surfkit.apps.sfm.ground_control import doubts, place_by_points, read_ground, read_list, triangulate
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import upside_down
+from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.survey_plausibility import upside_down
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import load_pycolmap
-from surfkit.runs.notes import collect_notes
+from surfkit.io.datasets.raw_dataset import load_pycolmap
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm, utm
 
 from .models import reconstruction

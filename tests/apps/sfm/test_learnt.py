@@ -10,9 +10,9 @@ import torch
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.sfm import matching
+from surfkit.apps.sfm import colmap_database as matching
 from surfkit.apps.sfm.engine import load_engine
-from surfkit.apps.sfm.learnt import ALIKED, DISK, KorniaSIFT
+from surfkit.apps.sfm.kornia_features import ALIKED, DISK, KorniaSIFT
 from surfkit.apps.sfm.lightglue import LightGlue
 from surfkit.apps.sfm.sift import SIFT
 from surfkit.apps.sfm.similarity import umeyama

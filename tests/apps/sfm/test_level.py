@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surfkit.apps.sfm.level import turn_upright, up_direction
+from surfkit.apps.sfm.gravity_alignment import turn_upright, up_direction
 
 from .pictures import looking
 

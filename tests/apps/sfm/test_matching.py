@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.apps.sfm import matching
+from surfkit.apps.sfm import colmap_database as matching
 from surfkit.apps.sfm.engine import load_engine
-from surfkit.apps.sfm.features import feature_file
-from surfkit.apps.sfm.learnt import DISK
+from surfkit.apps.sfm.feature_cache import feature_file
+from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.kornia_features import DISK
 from surfkit.apps.sfm.mapping import map_photographs
 from surfkit.apps.sfm.mutual import Mutual
-from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.core.codec import dump

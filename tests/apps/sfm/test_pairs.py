@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.pairs import (
+from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.pair_selection import (
     MAX_EXHAUSTIVE_PHOTOS,
     alike,
     choose_pairs,
@@ -17,7 +18,6 @@ from surfkit.apps.sfm.pairs import (
     sequence,
     vlad,
 )
-from surfkit.apps.sfm.photographs import Photo
 from surfkit.apps.sfm.settings import Settings
 
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from surfkit.apps.sfm import photographs
-from surfkit.apps.sfm.photographs import Photo, blurred_below, lens_groups, look
+from surfkit.apps.sfm import inspect_photos as photographs
+from surfkit.apps.sfm.inspect_photos import Photo, blurred_below, lens_groups, look
 from surfkit.core.check import BadInput
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 from .pictures import arc, picture, save
 

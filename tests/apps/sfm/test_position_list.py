@@ -6,7 +6,7 @@ import pytest
 
 from surfkit.apps.sfm.position_list import read_list
 from surfkit.core.check import BadInput
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import utm
 
 PLACE = (-33.9, 151.2, 120.5)

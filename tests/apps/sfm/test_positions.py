@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from surfkit.apps.sfm.exif import Exif
-from surfkit.apps.sfm.photographs import Photo
+from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.positions import settle
 from surfkit.apps.sfm.settings import Settings
 from surfkit.core.check import BadInput
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 BOTH = ("latitude", "longitude")
 HERE = (33.9, 151.2, 120.0)

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from surfkit.apps.sfm import deliver, features, mapping, matching
+from surfkit.apps.sfm import colmap_database as matching
+from surfkit.apps.sfm import dataset_export as deliver
+from surfkit.apps.sfm import feature_cache as features
+from surfkit.apps.sfm import mapping
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.cli import main
@@ -19,7 +22,7 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import observations, read
 from surfkit.scene.earth import from_utm
-from surfkit.testing.exif import write_exif
+from surfkit.testing.write_exif import write_exif
 
 from .pictures import arc, picture, save
 

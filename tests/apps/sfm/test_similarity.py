@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm import similarity
 from surfkit.apps.sfm.similarity import fit_robustly, umeyama
-from surfkit.io.datasets.georeference import Similarity
+from surfkit.io.datasets.topocentric import Similarity
 
 
 def known(count, seed=0, noise=0.0):

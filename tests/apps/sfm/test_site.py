@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.georeference import NoSimilarity, Placement
-from surfkit.apps.sfm.level import up_of
-from surfkit.apps.sfm.photographs import Photo
-from surfkit.apps.sfm.plausible import Handedness, upside_down
+from surfkit.apps.sfm.gravity_alignment import up_of
+from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.map_choice import decide, heights_named, locate, readings
 from surfkit.apps.sfm.positions import Positions
-from surfkit.apps.sfm.site import decide, heights_named, locate, readings
+from surfkit.apps.sfm.survey_plausibility import Handedness, upside_down
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.georeference import Similarity
-from surfkit.runs.notes import collect_notes
+from surfkit.io.datasets.topocentric import Similarity
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm
 
 from .models import down, reconstruction

@@ -10,8 +10,8 @@ import torch
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.sfm.features import feature_file, find_features, read_features
-from surfkit.apps.sfm.photographs import look
+from surfkit.apps.sfm.feature_cache import feature_file, find_features, read_features
+from surfkit.apps.sfm.inspect_photos import look
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.sources import look_at_all
 from surfkit.cli import main
@@ -19,7 +19,7 @@ from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import read_mask
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import photo_size, read_photo
 
 from .pictures import HEIGHT, WIDTH, arc, picture, save

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from needs import needs_native
 
-from surfkit.apps.sfm import features, matching, photographs, tie_points
+from surfkit.apps.sfm import colmap_database as matching
+from surfkit.apps.sfm import feature_cache as features
+from surfkit.apps.sfm import inspect_photos as photographs
+from surfkit.apps.sfm import tie_points
 from surfkit.cli import main
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import view_mask

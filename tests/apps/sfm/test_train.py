@@ -7,7 +7,8 @@ import sys
 import pytest
 from needs import needs_native
 
-from surfkit.apps.sfm import features, mapping
+from surfkit.apps.sfm import feature_cache as features
+from surfkit.apps.sfm import mapping
 from surfkit.cli import main
 
 from .pictures import arc, picture, save

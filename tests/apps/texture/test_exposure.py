@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
-from surfkit.apps.texture.exposure import GAIN_SIGMA, KNEE, MAX_GAIN, exposed, exposure_gains, levelled
+from surfkit.apps.texture.photo_gains import GAIN_SIGMA, KNEE, MAX_GAIN, exposed, exposure_gains, levelled
 
 
 def strip(exposures, slope=0.0, each=60):

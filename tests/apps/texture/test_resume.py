@@ -9,9 +9,16 @@ from interrupted import digests, interrupted_often
 from needs import needs
 from town import town
 
-from surfkit.apps.texture import deliver, make
-from surfkit.apps.texture.keep import TextureCache
-from surfkit.apps.texture.make import TEXTURE_RECORD, UNFINISHED_SUFFIX, MeshWithPhotos, TextureSettings, make_texture
+from surfkit.apps.texture import texture_export as deliver
+from surfkit.apps.texture import texture_mesh as make
+from surfkit.apps.texture.texture_cache import TextureCache
+from surfkit.apps.texture.texture_mesh import (
+    TEXTURE_RECORD,
+    UNFINISHED_SUFFIX,
+    MeshWithPhotos,
+    TextureSettings,
+    make_texture,
+)
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped
 from surfkit.core.lock import locked

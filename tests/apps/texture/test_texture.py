@@ -11,15 +11,19 @@ from needs import needs, needs_native
 from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
-from surfkit.apps.texture import exposure, make, pieces
-from surfkit.apps.texture import level as leveling
+from surfkit.apps.texture import photo_gains as exposure
+from surfkit.apps.texture import pieces
+from surfkit.apps.texture import seam_levelling as leveling
+from surfkit.apps.texture import texture_mesh as make
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
-from surfkit.apps.texture.charts import make_atlas, packed, texels_of
 from surfkit.apps.texture.choose import choose_views
-from surfkit.apps.texture.exposure import exposure_gains
 from surfkit.apps.texture.fill import paint
-from surfkit.apps.texture.look import look, look_in_numpy, project, sight
-from surfkit.apps.texture.make import (
+from surfkit.apps.texture.photo_gains import exposure_gains
+from surfkit.apps.texture.pieces import MeshClusters
+from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos
+from surfkit.apps.texture.regions import divide, middles
+from surfkit.apps.texture.texture_atlas import make_atlas, packed, texels_of
+from surfkit.apps.texture.texture_mesh import (
     MeshWithPhotos,
     TextureSettings,
     lay_out,
@@ -28,13 +32,11 @@ from surfkit.apps.texture.make import (
     make_texture,
     textured,
 )
-from surfkit.apps.texture.photographs import PrefetchedPhotos
-from surfkit.apps.texture.pieces import MeshClusters
-from surfkit.apps.texture.regions import divide, middles
 from surfkit.apps.texture.topology import neighbours, with_short_edges
+from surfkit.apps.texture.triangle_visibility import look, look_in_numpy, project, sight
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, Warned
-from surfkit.evaluate.geometry.surface import SurfaceFile
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.io.glb import read_glb
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
@@ -483,7 +485,7 @@ def test_coarser_texels_and_fewer_triangles(tmp_path):
 
 def test_texels_are_no_finer_than_pixels(tmp_path, monkeypatch):
     scene, told = town(tmp_path), []
-    monkeypatch.setattr("surfkit.apps.texture.make.emit", told.append)
+    monkeypatch.setattr("surfkit.apps.texture.texture_mesh.emit", told.append)
     records = {}
     for texel in ("auto", 1e-3, 1e9):
         settings = TextureSettings(formats=("glb",), texel=texel, pictures="png")
@@ -496,7 +498,7 @@ def test_texels_are_no_finer_than_pixels(tmp_path, monkeypatch):
 def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr("surfkit.io.glb.MAX_GLB_BYTES", 20_000)
     told = []
-    monkeypatch.setattr("surfkit.apps.texture.deliver.emit", told.append)
+    monkeypatch.setattr("surfkit.apps.texture.texture_export.emit", told.append)
     record = made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb", "obj")))
     assert "textured.glb" not in record["files"] and "textured.obj" in record["files"]
     said = [event.text for event in told if isinstance(event, Warned)]

@@ -15,7 +15,7 @@ from surfkit.cli import main
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 needs("fast_simplification")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from surfkit.apps.view.control import TrainingControl
-from surfkit.apps.view.follow import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
+from surfkit.apps.view.follow_journal import JournalFollower, StageHistory, journals, newest_pictures, running_blocks
 from surfkit.apps.view.live_panel import ELSEWHERE, NO_STEPS, OPAQUE_METHOD, in_words
 from surfkit.core.codec import dump
 from surfkit.core.events import Measured, StageBegan, StepDone, emit
-from surfkit.runs.execute.state import BlockState, state_path
+from surfkit.runs.execute.block_state import BlockState, state_path
 from surfkit.runs.journal import record_events
 
 

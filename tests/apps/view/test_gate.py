@@ -10,8 +10,8 @@ import pytest
 from browser import get
 from needs import needs
 
-from surfkit.apps.view.gate import AuthRequest, TokenAuth
 from surfkit.apps.view.server import Address, listen, served
+from surfkit.apps.view.token_auth import AuthRequest, TokenAuth
 from surfkit.core.check import BadInput
 
 GATE = TokenAuth("right", 8080)

@@ -19,13 +19,13 @@ from models import data_set
 from needs import needs, needs_native
 
 from surfkit.apps.view import live
+from surfkit.apps.view.browser_camera import WORLD
 from surfkit.apps.view.control import TrainingControl
+from surfkit.apps.view.framed_pictures import BESIDE_GREY, FramedPictures, framed, window_of
 from surfkit.apps.view.live import live_view, rest
 from surfkit.apps.view.live_page import SceneWithoutModel
-from surfkit.apps.view.measure import coordinates
-from surfkit.apps.view.on_page import BESIDE_GREY, FramedPictures, framed, window_of
+from surfkit.apps.view.measure_clicks import coordinates
 from surfkit.apps.view.picking import surface_depth
-from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, listen
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
@@ -36,13 +36,13 @@ from surfkit.io.datasets.read import read
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.train import checkpoint
 from surfkit.train.refine import PruneAndRecover
 from surfkit.train.state import StageState
-from surfkit.train.views import ViewOrder
+from surfkit.train.view_order import ViewOrder
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 
 STEPS = 24

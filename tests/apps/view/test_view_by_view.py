@@ -12,15 +12,15 @@ import torch
 from browser import Browser, wait_until
 from needs import needs, needs_native
 
-from surfkit.apps.view.by_view import LodCamera, LodSplats, SampledSplats, in_places, reach_of, visibility
-from surfkit.apps.view.page import show
-from surfkit.apps.view.screen import REST_S, TICK_S, WORLD, BrowserCamera, CameraFollower
+from surfkit.apps.view.browser_camera import REST_S, TICK_S, WORLD, BrowserCamera, CameraFollower
+from surfkit.apps.view.lod_selection import LodCamera, LodSplats, SampledSplats, in_places, reach_of, visibility
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import SharedCache
-from surfkit.apps.view.subject import ViewerScene
+from surfkit.apps.view.shared_cache import SharedCache
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerScene
 from surfkit.compress.levels import MergedLevels
 from surfkit.compress.levels.base import LodInput
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera

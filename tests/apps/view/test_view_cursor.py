@@ -16,13 +16,13 @@ from browser import Browser, ask, cookie, get, tag, wait_until
 from needs import needs
 from scipy.spatial.transform import Rotation
 
-from surfkit.apps.view.answers import Script, with_script
+from surfkit.apps.view.browser_camera import WORLD
 from surfkit.apps.view.cursor import Cursor
-from surfkit.apps.view.page import show
+from surfkit.apps.view.http_answers import Script, with_script
 from surfkit.apps.view.picking import PointPicker, hit_points
-from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import ViewerPoints, ViewerScene
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerPoints, ViewerScene
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import Frame

@@ -12,7 +12,8 @@ from needs import needs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from surfkit.apps.view.display import (
+from surfkit.apps.view.browser_camera import whole_view
+from surfkit.apps.view.browser_geometry import (
     by_block,
     by_height,
     by_normal,
@@ -22,14 +23,13 @@ from surfkit.apps.view.display import (
     normals_of,
     some,
 )
-from surfkit.apps.view.glb import unlit_glb
-from surfkit.apps.view.pictures import WORST_ERROR, error_picture, picture, thumbnail
-from surfkit.apps.view.screen import whole_view
-from surfkit.apps.view.shelf import SharedCache
-from surfkit.apps.view.subject import ViewerScene
-from surfkit.compress.levels.tree import LodBlock, LodTree
+from surfkit.apps.view.error_pictures import WORST_ERROR, error_picture, picture, thumbnail
+from surfkit.apps.view.shared_cache import SharedCache
+from surfkit.apps.view.unlit_glb import unlit_glb
+from surfkit.apps.view.viewer_scene import ViewerScene
+from surfkit.compress.levels.lod_tree import LodBlock, LodTree
 from surfkit.core.check import BadInput
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.model import SplatModel

@@ -9,9 +9,9 @@ from browser import Browser, wait_until
 from needs import needs
 
 from surfkit.apps.view.film import FilmTool
-from surfkit.apps.view.page import show
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import ViewerPoints, ViewerScene
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerPoints, ViewerScene
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import Frame
 

@@ -12,7 +12,7 @@ from surfkit.apps.render.path import from_file, posed
 from surfkit.apps.view.crop_box import edges, sizes, turned_box, upright_axis
 from surfkit.apps.view.keyframes import KeyPath, write_path
 from surfkit.apps.view.layers import frustum_lines
-from surfkit.apps.view.measure import coordinates, decimals, in_words, measured, path_lines, shown
+from surfkit.apps.view.measure_clicks import coordinates, decimals, in_words, measured, path_lines, shown
 from surfkit.apps.view.outlines import block_outlines, outline, spread_out
 from surfkit.apps.view.picking import TrianglePicker, corners_of, hit_camera, hit_points, hit_splats
 from surfkit.apps.view.tools import free_name
@@ -22,8 +22,8 @@ from surfkit.partition.base import Cells, Contraction, Ground
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.select import select
-from surfkit.runs.method import with_drawing
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.run_method import with_drawing
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import read_crop, write_crop
 from surfkit.scene.scene import Frame, Scene, SparsePoints, View

@@ -9,24 +9,24 @@ from browser import Browser
 from needs import needs
 from PIL import Image
 
-from surfkit.apps.texture.files import AtlasPageMesh, write_obj, write_textured_glb
+from surfkit.apps.texture.obj_glb import AtlasPageMesh, write_obj, write_textured_glb
+from surfkit.apps.view.browser_camera import WORLD
 from surfkit.apps.view.mesh_files import textured
-from surfkit.apps.view.page import show
-from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.subject import opened_subject, textured_mesh
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import opened_subject, textured_mesh
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.place import place_of, root_of
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.file_transform import place_of, root_of
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.splats.gltf_reader import UPS
 from surfkit.io.splats.sog import SOG
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.files import write_mesh
-from surfkit.runs.notes import collect_notes
+from surfkit.mesh.mesh_export import write_mesh
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 CORNERS = np.array([[0, 0, 0.1], [1, 0, 0.2], [0, 1, -0.3], [1, 1, 0.0]], np.float32)
 MESH = Mesh(CORNERS, np.array([[0, 1, 2], [2, 1, 3]], np.int32))

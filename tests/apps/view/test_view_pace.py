@@ -11,8 +11,7 @@ import torch
 from browser import Browser, cookie, get
 from needs import needs
 
-from surfkit.apps.view.by_view import LodCamera, SampledPoints
-from surfkit.apps.view.pace import (
+from surfkit.apps.view.draw_limits import (
     INITIAL_LIMITS,
     LATE_S,
     MAX_UNASKED_ITEMS,
@@ -21,11 +20,12 @@ from surfkit.apps.view.pace import (
     DrawLimit,
     numbers,
 )
-from surfkit.apps.view.page import show
+from surfkit.apps.view.lod_selection import LodCamera, SampledPoints
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import MAX_POINT_ENLARGEMENT, SharedCache
-from surfkit.apps.view.subject import ViewerPoints, ViewerScene
-from surfkit.io.splats.table import SplatTable
+from surfkit.apps.view.shared_cache import MAX_POINT_ENLARGEMENT, SharedCache
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import ViewerPoints, ViewerScene
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
@@ -289,7 +289,7 @@ def test_a_mesh_keeps_pace_too(tmp_path):
 
 
 def test_without_a_word_from_the_browser_nothing_is_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr("surfkit.apps.view.page.HELLO_S", 0.05)
+    monkeypatch.setattr("surfkit.apps.view.viewer_page.HELLO_S", 0.05)
     with shown(subject(points=points()), tmp_path) as page:
         browser = Browser(page.url)
         browser.wait_for(Browser.is_whole)

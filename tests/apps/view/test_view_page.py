@@ -18,26 +18,26 @@ from browser import Browser, wait_until
 from models import ORIGIN, data_set, like_3dgs
 from needs import needs, needs_native
 
+from surfkit.apps.view.browser_camera import WORLD
+from surfkit.apps.view.escape_text import as_text
 from surfkit.apps.view.film import FilmTool
-from surfkit.apps.view.page import show
-from surfkit.apps.view.plain import as_text
-from surfkit.apps.view.screen import WORLD
 from surfkit.apps.view.server import Address, served
-from surfkit.apps.view.shelf import SharedCache
-from surfkit.apps.view.subject import opened_subject
+from surfkit.apps.view.shared_cache import SharedCache
+from surfkit.apps.view.viewer_page import show
+from surfkit.apps.view.viewer_scene import opened_subject
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.las import read_las
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.io.splats.files import format_for, format_of
 from surfkit.io.splats.ply import write_splats
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_files import format_for, format_of
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.files import write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.partition.base import Cells, Ground
 from surfkit.partition.plan import BlockPlan, PartitionPlan
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
 
@@ -359,7 +359,7 @@ def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
     assert "/points" in names and (subject.frame.crs, subject.frame.metres) == ("EPSG:32632", 1.0)
     assert np.allclose(subject.frame.to_input(subject.points.xyz), many, atol=1e-3)
     assert subject.points.rgb[:, 0].tolist() == list(range(250)) and (subject.points.rgb[:, 1:] == [255, 0]).all()
-    monkeypatch.setattr("surfkit.apps.view.subject.MAX_CLOUD_POINTS", 100)
+    monkeypatch.setattr("surfkit.apps.view.viewer_scene.MAX_CLOUD_POINTS", 100)
     monkeypatch.setattr("surfkit.evaluate.geometry.las.CHUNK_POINTS", 64)
     places = cloud(tmp_path / "b.las", 6)
     with opened_subject(tmp_path / "b.las", "cpu") as subject:

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 from markdown_it import MarkdownIt
 
-from surfkit.apps.view import photographs
-from surfkit.apps.view.plain import as_code, as_text
+from surfkit.apps.view import photo_comparison as photographs
+from surfkit.apps.view.escape_text import as_code, as_text
 from surfkit.core.check import BadInput
 
 NAMES = [

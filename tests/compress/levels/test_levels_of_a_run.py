@@ -17,9 +17,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.io.datasets.data import Data
 from surfkit.primitives import Surfel2D
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import discard_results
-from surfkit.runs.lod import load_levels, make_levels
+from surfkit.runs.make_levels import load_levels, make_levels
 from surfkit.runs.pipeline import loaded, run, with_steps
 from surfkit.runs.recipe import Recipe
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -124,7 +124,7 @@ def test_further_steps_discard_them(copy):
 
 def test_interrupted_and_continued(copy, monkeypatch):
     """What is finished of the levels is kept; what is there of an earlier model stays until the new ones are whole."""
-    from surfkit.compress.levels import refine
+    from surfkit.compress.levels import refine_levels as refine
 
     whole = (copy / "lod" / "level1.safetensors").read_bytes(), (copy / "lod" / "level2.safetensors").read_bytes()
     once, made = refine._optimised, []

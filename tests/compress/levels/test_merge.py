@@ -9,9 +9,9 @@ import torch
 from surfkit import Activation, Column, Primitive, standard_columns
 from surfkit.compress.levels import MergedLevels
 from surfkit.compress.levels.cut import cut, depth_for
-from surfkit.compress.levels.merge import blocks
+from surfkit.compress.levels.merge_cost import MergeCost, groups
+from surfkit.compress.levels.merged_levels import blocks
 from surfkit.compress.levels.moments import Shapes, merged_model
-from surfkit.compress.levels.pairs import MergeCost, groups
 from surfkit.core.check import BadInput
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.init import seeds
@@ -262,7 +262,7 @@ def test_levels_that_an_interrupted_call_has_kept_are_not_made_again(tmp_path, m
     given, lod = replace(lod_input(), folder=tmp_path), MergedLevels(tile_points=100, steps=5)
     whole = lod.build(given)
     (tmp_path / "level2.safetensors").write_bytes(b"damaged")
-    from surfkit.compress.levels import refine
+    from surfkit.compress.levels import refine_levels as refine
 
     made = []
     once = refine._optimised

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from surfkit.compress.levels import PrunedLevels
-from surfkit.compress.levels.sound import fault
+from surfkit.compress.levels.validate_levels import fault
 from surfkit.core.check import BadInput
 from surfkit.densify.prune import importance
 from surfkit.testing.inputs import lod_input
-from surfkit.train.views import ViewContributions
+from surfkit.train.view_order import ViewContributions
 
 CELLS = 4
 

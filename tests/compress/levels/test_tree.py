@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from surfkit.compress.levels import MergedLevels
-from surfkit.compress.levels.sound import fault
-from surfkit.compress.levels.tree import LodBlock, LodTree
+from surfkit.compress.levels.lod_tree import LodBlock, LodTree
+from surfkit.compress.levels.validate_levels import fault
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame

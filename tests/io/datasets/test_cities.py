@@ -14,7 +14,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import read_priors
 from surfkit.io.datasets.read import RANDOM_POINTS, read
 from surfkit.io.datasets.split import GauUScene
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
 

@@ -13,7 +13,7 @@ from surfkit.core.check import BadInput
 from surfkit.io.datasets import colmap
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import RANDOM_POINTS, read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[3] / "examples" / "boruszyn"

@@ -10,11 +10,11 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets import undistort
-from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.datasets.read import observations, read
-from surfkit.runs.notes import collect_notes
-from surfkit.scene import copies
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene import decoded_photos as copies
 from surfkit.scene.photos import read_photo, view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

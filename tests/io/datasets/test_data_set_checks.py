@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from surfkit.core.registry import components
-from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.depth_files import DepthFile, write_map
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery
 from surfkit.io.datasets.depth_layouts import EstimatedDepths
+from surfkit.io.datasets.raw_dataset import RawDataset
 from surfkit.io.datasets.split import Split
 from surfkit.testing import check_depth_layout, check_split
 

@@ -11,7 +11,7 @@ from data_set_folders import FLIGHT, blender, lens, nerfstudio, odm, pixels_of, 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import RANDOM_POINTS, observations, read, read_capture, reader_of
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Mask
 from surfkit.testing.synthetic import photograph

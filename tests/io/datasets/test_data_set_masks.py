@@ -15,7 +15,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.fingerprint import changed, fingerprint
 from surfkit.io.datasets.masks import mask_cache, read_mask, view_mask
 from surfkit.io.datasets.read import build_scene, read, read_capture, reader_of
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Mask, Scene, SparsePoints
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

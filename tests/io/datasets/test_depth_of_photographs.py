@@ -7,15 +7,15 @@ from data_set_folders import FLIGHT, lens, nerfstudio, views_of
 
 from surfkit.apps.doctor.examine import examine
 from surfkit.cli.recipes import recipes
-from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import confidence_path, normal_path, save_array, write_map, write_record
 from surfkit.io.datasets.depth_prior import alignment, read_priors
 from surfkit.io.datasets.depth_sampling import straightened
 from surfkit.io.datasets.extract import load, of, save
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.datasets.read import read
 from surfkit.io.datasets.undistort import lens_of
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import photograph
 
 BENT = {"k1": -0.15, "k2": 0.02, "p1": 0.003, "p2": -0.002}

@@ -17,7 +17,7 @@ from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_prior import alignment, list_reasons, read_priors, resized
 from surfkit.io.datasets.read import observations, read
 from surfkit.losses import L1, DepthRegression, NormalConsistency, NormalPrior
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.align import align, sample
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.data_cache import scale_band

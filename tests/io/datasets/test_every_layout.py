@@ -11,7 +11,7 @@ from data_set_folders import FLIGHT, blender, city, nerfstudio, odm, save, surve
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.io.datasets.capture import load_pycolmap
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.splats.ply import read_splats
 from surfkit.testing.synthetic import Flight, look, photograph, write_colmap
 

@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput, collecting
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.read import observations, read, read_capture, reader_of
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
 AXES = ("XRightYUp", "XLeftYDown", "XLeftYUp", "XDownYRight", "XDownYLeft", "XUpYRight", "XUpYLeft")

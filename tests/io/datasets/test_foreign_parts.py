@@ -14,19 +14,19 @@ from surfkit.core.check import BadInput
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.capture import RawDataset
 from surfkit.io.datasets.colmap import COLMAP
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile, write_map, write_record
 from surfkit.io.datasets.depth_layout import DepthLayout, DepthQuery, find_maps
 from surfkit.io.datasets.depth_prior import prior_files, read_priors
 from surfkit.io.datasets.fingerprint import changed, fingerprint
+from surfkit.io.datasets.raw_dataset import RawDataset
 from surfkit.io.datasets.read import read
 from surfkit.io.datasets.split import GauUScene, Split
 from surfkit.runs.command import train_command
 from surfkit.runs.folder import read_data
-from surfkit.runs.notes import collect_notes
 from surfkit.runs.pipeline import opened
+from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 

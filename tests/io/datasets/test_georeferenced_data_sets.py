@@ -11,12 +11,12 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.georeference import place_on_earth
 from surfkit.io.datasets.opensfm import ODM
 from surfkit.io.datasets.read import observations, read, read_capture
+from surfkit.io.datasets.topocentric import place_on_earth
 from surfkit.io.splats.ply import read_splats, read_vertices, write_splats
-from surfkit.io.splats.table import SplatTable
-from surfkit.runs.notes import collect_notes
+from surfkit.io.splats.splat_table import SplatTable
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import utm
 from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

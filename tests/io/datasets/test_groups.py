@@ -10,9 +10,9 @@ from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
-from surfkit.scene import groups
-from surfkit.scene.groups import connect_groups, groups_warning, untied_warning
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene import connected_photos as groups
+from surfkit.scene.connected_photos import connect_groups, groups_warning, untied_warning
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(kind="grid", views=16, width=24, height=18, points=400)

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.capture import load_pycolmap
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.fingerprint import changed, fingerprint
 from surfkit.io.datasets.masks import mask_cache, view_mask
 from surfkit.io.datasets.panoramas import CUBE_FACES
+from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.datasets.read import observations, read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.scene.pixels import DEFAULT_PIXELS
 

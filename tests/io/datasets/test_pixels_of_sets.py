@@ -11,13 +11,14 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
-from surfkit.io.datasets import extract, pixels
+from surfkit.io.datasets import extract
+from surfkit.io.datasets import pixel_interpretation as pixels
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.masks import read_mask, view_mask
-from surfkit.io.datasets.pixels import decide
+from surfkit.io.datasets.pixel_interpretation import decide
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
-from surfkit.scene.copies import DecodedPhotoCache
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.decoded_photos import DecodedPhotoCache
 from surfkit.scene.photos import photo_cache, view_photo
 from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask

@@ -29,7 +29,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.geocentric import place_of
 from surfkit.io.datasets.read import observations, read, read_capture, reader_of
 from surfkit.io.splats.ply import write_points
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import warn_of_gaps
 from surfkit.scene.earth import geocentric
 

@@ -10,7 +10,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import read_photo, view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

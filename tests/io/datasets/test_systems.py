@@ -5,7 +5,7 @@ import pyproj
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets.systems import covers, names_a_system, system_of
+from surfkit.io.datasets.crs_names import covers, names_a_system, system_of
 
 
 @pytest.mark.parametrize(

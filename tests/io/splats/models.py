@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from surfkit.io.splats.table import SPLAT_COLUMNS, SplatTable
+from surfkit.io.splats.splat_table import SPLAT_COLUMNS, SplatTable
 
 
 def table(kind="gaussian", count=700, degree=3, seed=0, **changes):

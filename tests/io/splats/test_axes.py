@@ -10,13 +10,13 @@ import torch
 import zstandard
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.axes import AXES_NAMES, turn_between
-from surfkit.io.splats.files import from_axes, read_splat_file
+from surfkit.io.splats.file_axes import AXES_NAMES, turn_between
 from surfkit.io.splats.gltf import GLTF
+from surfkit.io.splats.rotate_splats import basis
+from surfkit.io.splats.splat_files import from_axes, read_splat_file
 from surfkit.io.splats.spz import SPZ
-from surfkit.io.splats.turn import basis
-from surfkit.runs.notes import collect_notes
-from surfkit.testing.files import splat_table
+from surfkit.runs.run_notes import collect_notes
+from surfkit.testing.format_checks import splat_table
 
 from .models import differences, turned
 from .test_gltf import foreign, glb

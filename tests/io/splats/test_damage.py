@@ -20,9 +20,9 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.io.splats.compressed_ply import CompressedPLY
-from surfkit.io.splats.files import format_for, read_splat_file
 from surfkit.io.splats.sog import SOG
 from surfkit.io.splats.splat import Splat
+from surfkit.io.splats.splat_files import format_for, read_splat_file
 from surfkit.io.splats.spz import SPZ
 
 from .models import table

@@ -15,13 +15,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import components
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.compressed_ply import CompressedPLY
-from surfkit.io.splats.files import format_for, format_of, read_splat_file
 from surfkit.io.splats.ply import PLY, read_splats, write_splats
 from surfkit.io.splats.sog import SOG
 from surfkit.io.splats.splat import Splat
+from surfkit.io.splats.splat_files import format_for, format_of, read_splat_file
+from surfkit.io.splats.splat_table import THINNESS
 from surfkit.io.splats.spz import SPZ
-from surfkit.io.splats.table import THINNESS
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.scene import Frame
 
 from .models import differences, same, table, turned

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from surfkit.core.check import BadInput
 from surfkit.io.splats.gltf import GLTF, UPS
 from surfkit.io.splats.gltf_reader import read_splats
+from surfkit.io.splats.rotate_splats import turned
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.io.splats.spz import spz_bytes
-from surfkit.io.splats.table import SplatTable
-from surfkit.io.splats.turn import turned
 from surfkit.scene.scene import Frame
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 SPLATS, COMPRESSED = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 

@@ -16,8 +16,8 @@ from PIL import Image
 from surfkit.io.splats.compressed_ply import CompressedPLY
 from surfkit.io.splats.sog import SOG
 from surfkit.io.splats.splat import Splat
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.io.splats.spz import SPZ
-from surfkit.io.splats.table import SplatTable
 from surfkit.scene.scene import Frame
 
 C0 = 0.28209479177387814

@@ -6,7 +6,7 @@ import torch
 
 from surfkit.io.splats.bits import outlying_order
 from surfkit.io.splats.compressed_ply import CompressedPLY
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 
 from .models import table
 

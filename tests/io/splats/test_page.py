@@ -24,10 +24,10 @@ from surfkit.core.check import BadInput
 from surfkit.io.splats.page import HtmlPageFormat
 from surfkit.raster.api import Splats
 from surfkit.raster.reference import draw
-from surfkit.runs.notes import collect_notes
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 from .models import turned
 

@@ -11,7 +11,7 @@ from needs import needs
 from surfkit.core.check import BadInput
 from surfkit.io.splats import ply
 from surfkit.io.splats.ply import read_splats, read_vertices, write_points, write_splats
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 from surfkit.scene.scene import Frame
 
 

@@ -12,7 +12,7 @@ import torch
 
 from surfkit.core.registry import components
 from surfkit.io.splats.base import Format
-from surfkit.io.splats.table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable
 
 READERS = Path(__file__).parents[3] / "bench" / "readers"
 COUNT = 300

@@ -13,10 +13,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.io.glb import read_glb
 from surfkit.io.splats.gltf_reader import read_splats
-from surfkit.io.splats.table import SplatTable, Tile
+from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.tiles3d import Tiles3D
 from surfkit.scene.scene import Frame
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 ORIGIN = np.array([500_123.0, 5_783_283.0, 120.0])
 ECEF = (3657232.9425397757, 1404012.0004179883, 5016568.267984122)  # of ORIGIN in EPSG:32634, by pyproj 3.7

@@ -9,8 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
-from surfkit.io.splats.turn import basis, parts_of, turned
-from surfkit.testing.files import splat_table
+from surfkit.io.splats.rotate_splats import basis, parts_of, turned
+from surfkit.testing.format_checks import splat_table
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.emulated import Emulated, compiler
 from surfkit.raster.nvrtc.modules import Kernels, kernels
-from surfkit.raster.nvrtc.source import CudaSource
 
 
 @pytest.fixture(autouse=True, scope="session")

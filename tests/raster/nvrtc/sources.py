@@ -6,9 +6,10 @@ from pathlib import Path
 
 from surfkit.compress.cuda import codes
 from surfkit.depth.cuda import passes
-from surfkit.mesh.cuda import grid
-from surfkit.raster.cuda import rasterizer, ssim
-from surfkit.raster.nvrtc.source import CudaSource
+from surfkit.mesh.cuda import gpu_grid as grid
+from surfkit.raster.cuda import cuda_ssim as ssim
+from surfkit.raster.cuda import rasterizer
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.train import adam
 
 KERNELS = Path(__file__).parent / "kernels"

@@ -9,10 +9,10 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc import nvrtc as module
 from surfkit.raster.nvrtc.arguments import BufferArgument
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.driver import Driver
 from surfkit.raster.nvrtc.modules import Compiled, Emulated, kernels
 from surfkit.raster.nvrtc.nvrtc import Nvrtc, image, nvrtc, resources
-from surfkit.raster.nvrtc.source import CudaSource
 
 from .sources import BASIC, KERNELS, SHIPPED, Affine
 

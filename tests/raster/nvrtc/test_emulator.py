@@ -8,9 +8,9 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.raster.nvrtc import emulated
+from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.raster.nvrtc.modules import kernels
-from surfkit.raster.nvrtc.source import CudaSource
 
 from .conftest import Anywhere
 from .sources import BASIC, KERNELS, Affine

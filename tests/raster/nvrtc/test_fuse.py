@@ -8,10 +8,10 @@ import torch
 from mesh.shapes import around, look_at, seen, slope, sphere
 
 from surfkit.core.check import BadInput
-from surfkit.mesh.cuda import grid as module
-from surfkit.mesh.cuda.grid import FUSION_SOURCE, GpuGrid, most_blocks, view_of
+from surfkit.mesh.cuda import gpu_grid as module
+from surfkit.mesh.cuda.gpu_grid import FUSION_SOURCE, GpuGrid, most_blocks, view_of
 from surfkit.mesh.lattice import BLOCK_BYTES, BLOCK_SIDE_VOXELS, FADE_START_VOXELS, FULL_WEIGHT, FusionImage, Lattice
-from surfkit.mesh.reference import ReferenceGrid, unpack
+from surfkit.mesh.reference_grid import ReferenceGrid, unpack
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.raster.nvrtc.nvrtc import nvrtc
 from surfkit.scene.camera import Camera

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from surfkit.raster.cuda import ssim
+from surfkit.raster.cuda import cuda_ssim as ssim
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.raster.ssim import ssim_reference
 from surfkit.train import adam

@@ -8,7 +8,7 @@ import torch
 from needs import needs_native
 
 from surfkit.depth.cuda.passes import SOURCE_BY_SAMPLES, GpuPasses
-from surfkit.depth.native import GreyImage, MatchingSettings, Planes, improve
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve
 from surfkit.raster.nvrtc.emulated import Emulated, KernelError
 from surfkit.scene.camera import Camera
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from surfkit.raster.cuda.ssim import SSIM_SOURCE, backward, forward
+from surfkit.raster.cuda.cuda_ssim import SSIM_SOURCE, backward, forward
 from surfkit.raster.nvrtc.modules import Kernels
 from surfkit.raster.ssim import ssim_reference
 

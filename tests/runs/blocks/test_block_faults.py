@@ -27,17 +27,19 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
-from surfkit.runs.blocks import forecast, schedule, worker
+from surfkit.runs.blocks import block_forecast as forecast
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks import worker
 from surfkit.runs.blocks.block import BlockRun, read_plan
 from surfkit.runs.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, apply_fallback, next_fallback
-from surfkit.runs.blocks.schedule import Compute, Unfinished
+from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute import Pool, base
 from surfkit.runs.execute.base import Job, JobResult
-from surfkit.runs.execute.state import BlockState, read_state, write_state
+from surfkit.runs.execute.block_state import BlockState, read_state, write_state
 from surfkit.runs.pipeline import opened, run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.stage import Intervals
-from surfkit.scene import memory
+from surfkit.runs.run_stage import Intervals
+from surfkit.scene import available_memory as memory
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
@@ -350,7 +352,7 @@ def test_two_drivers_in_one_folder(undisturbed, data, tmp_path, capsys):
     words = ["train", f"recipe:{undisturbed / 'recipe.json'}", "--data", str(data.path), "--out", str(out)]
     words += ["--device", "cpu", "--checkpoint-every", "3", "--pictures-every", "0"]
     halting = (
-        "import os, signal, sys, surfkit.runs.stage as o\nD = o.Display\n"
+        "import os, signal, sys, surfkit.runs.run_stage as o\nD = o.Display\n"
         "class Halting(D):\n    def show(self, done):\n        super().show(done)\n"
         "        if done.index == 3: os.kill(os.getpid(), signal.SIGSTOP)\n"
         f"o.Display = Halting\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"

@@ -17,13 +17,15 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
 from surfkit.raster.select import select
 from surfkit.runs import pipeline
-from surfkit.runs.blocks import forecast, schedule, worker
+from surfkit.runs.blocks import block_forecast as forecast
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks import worker
 from surfkit.runs.blocks.block import BlockRun
-from surfkit.runs.blocks.schedule import Compute, Unfinished
+from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute import Inline, Pool
-from surfkit.runs.execute.state import read_state
+from surfkit.runs.execute.block_state import read_state
 from surfkit.runs.pipeline import load_run, run
-from surfkit.runs.stage import Intervals
+from surfkit.runs.run_stage import Intervals
 from surfkit.train import checkpoint, streaming
 from surfkit.train.data_cache import CacheSettings
 
@@ -102,7 +104,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
         job = command(ctx, block, compute)
         if block.index == 0 and not (tmp_path / "killed").exists():
             code = (
-                "import os, sys, surfkit.runs.stage as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(tmp_path / 'killed')!r}).touch(); os.kill(os.getpid(), 9)\n"
                 f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"

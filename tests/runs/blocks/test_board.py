@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from surfkit.apps.status import rows
-from surfkit.runs.blocks.display import BlockDisplay, BlockProgress, progress_table, read_state_since
+from surfkit.runs.blocks.block_display import BlockDisplay, BlockProgress, progress_table, read_state_since
 from surfkit.runs.blocks.eta import (
     describe_progress,
     seconds_elapsed,
@@ -17,8 +17,8 @@ from surfkit.runs.blocks.eta import (
     steps_per_second,
     total_seconds_left,
 )
-from surfkit.runs.execute.state import BlockState, read_state, write_state
-from surfkit.runs.status import SHOWN_FIELDS, BlockStatus, Status
+from surfkit.runs.execute.block_state import BlockState, read_state, write_state
+from surfkit.runs.run_status import SHOWN_FIELDS, BlockStatus, Status
 from surfkit.train import progress
 
 RUNNING = BlockState("running", step=130, steps=300, first=30, began=1000.0, heard=1020.0)
@@ -63,7 +63,7 @@ def test_time_left_of_all_blocks():
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch):
-    monkeypatch.setattr("surfkit.runs.blocks.display.BOARD_LINE_EVERY_S", 0.02)
+    monkeypatch.setattr("surfkit.runs.blocks.block_display.BOARD_LINE_EVERY_S", 0.02)
     text, began = io.StringIO(), time.monotonic()
     with BlockDisplay(lambda: BlockProgress(STATES, 300, 2), Console(file=text)):
         wait_until(lambda: text.getvalue().count("\n") > 4)
@@ -82,7 +82,7 @@ def test_a_table_on_a_terminal():
 
 
 def test_a_larger_display_gets_the_sum(monkeypatch):
-    monkeypatch.setattr("surfkit.runs.blocks.display.BOARD_EVERY_S", 0.01)
+    monkeypatch.setattr("surfkit.runs.blocks.block_display.BOARD_EVERY_S", 0.01)
     seen = []
     with progress.outer(lambda *line: seen.append(line)), BlockDisplay(lambda: BlockProgress(STATES, 300)):
         wait_until(lambda: seen)

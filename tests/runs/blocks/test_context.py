@@ -18,10 +18,11 @@ from surfkit.io.datasets.depth_files import confidence_path, map_path, write_map
 from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare
 from surfkit.raster.select import select
-from surfkit.runs.blocks import forecast as forecasts
-from surfkit.runs.blocks import schedule, worker
+from surfkit.runs.blocks import block_forecast as forecasts
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks import worker
 from surfkit.runs.blocks.block import BlockRun
-from surfkit.runs.blocks.forecast import (
+from surfkit.runs.blocks.block_forecast import (
     FROZEN_POINT_BYTES,
     TRAINED_POINT_BYTES,
     BlockPoints,
@@ -29,9 +30,9 @@ from surfkit.runs.blocks.forecast import (
     initial_points,
     point_memory,
 )
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute import Pool
-from surfkit.runs.execute.state import read_state
+from surfkit.runs.execute.block_state import read_state
 from surfkit.runs.pipeline import load_run, run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -133,7 +134,7 @@ def killed_in_block_1(monkeypatch):
         mark = ctx.run.out / "killed"
         if block.index == 1 and not mark.exists():
             code = (
-                "import os, sys, surfkit.runs.stage as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(mark)!r}).touch(); os.kill(os.getpid(), 9)\n"
                 f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.schedule import LearningRate
 from surfkit.runs import pipeline
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.runs.recipe import Recipe

@@ -12,7 +12,7 @@ from surfkit.losses.consensus import Consensus, column
 from surfkit.partition import PictureShare
 from surfkit.runs.blocks import rounds, worker
 from surfkit.runs.blocks.block import BlockRun, agreement_file, read_plan, rounds_agreed
-from surfkit.runs.blocks.schedule import Compute, Unfinished
+from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute.base import Inline, JobResult
 from surfkit.runs.pipeline import opened, run, with_steps
 from surfkit.train import checkpoint

@@ -13,13 +13,14 @@ from two_blocks import EVERY, same
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.runs.blocks import schedule, worker
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks import worker
 from surfkit.runs.blocks.block import BlockRun, read_plan
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.blocks.worker import heartbeats
 from surfkit.runs.execute.base import Job, JobResult
+from surfkit.runs.execute.block_state import STALE_S, read_state, write_state
 from surfkit.runs.execute.remote import DRIVER
-from surfkit.runs.execute.state import STALE_S, read_state, write_state
 from surfkit.runs.pipeline import opened, run
 
 LATER_S = 3600.0

@@ -19,11 +19,12 @@ from needs import needs
 from two_blocks import EVERY, same, stop_after
 
 from surfkit.core.check import BadInput
-from surfkit.runs.blocks import schedule, worker
-from surfkit.runs.blocks.schedule import Compute, Unfinished
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks import worker
+from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute import Ray
 from surfkit.runs.execute.base import LOG, Job
-from surfkit.runs.execute.state import read_state
+from surfkit.runs.execute.block_state import read_state
 from surfkit.runs.pipeline import run
 from surfkit.testing import check_executor
 
@@ -168,7 +169,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     reached, gone, command = tmp_path / "reached", tmp_path / "gone", schedule.job_of
     tests = str(Path(__file__).parents[2])
     code = (
-        f"import psutil, sys, surfkit.runs.stage as o\nsys.path[:0] = {[tests]}\n"
+        f"import psutil, sys, surfkit.runs.run_stage as o\nsys.path[:0] = {[tests]}\n"
         "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
         f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if there and done.index == 7:\n"

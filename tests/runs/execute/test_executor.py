@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.runs.execute import base
 from surfkit.runs.execute.base import LOG, Inline, Job, Pool
-from surfkit.runs.execute.state import STALE_S, BlockState, find_worker, read_state, write_state
+from surfkit.runs.execute.block_state import STALE_S, BlockState, find_worker, read_state, write_state
 
 
 def job(folder: Path, index: int, code: str = "", **more) -> Job:

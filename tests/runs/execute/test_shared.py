@@ -16,7 +16,7 @@ import pytest
 from surfkit.runs.execute import remote
 from surfkit.runs.execute.base import LOG, Job
 from surfkit.runs.execute.remote import RemoteJob, RemoteResult, run_remote_job
-from surfkit.runs.execute.shared import MARK_PREFIX, mark_folder, remote_job
+from surfkit.runs.execute.shared_filesystem import MARK_PREFIX, mark_folder, remote_job
 
 HOST = socket.gethostname()
 

@@ -14,12 +14,12 @@ from needs import needs
 from two_blocks import EVERY, same
 
 from surfkit.core.check import BadInput
-from surfkit.runs.blocks import schedule
-from surfkit.runs.blocks.schedule import Compute, Unfinished
+from surfkit.runs.blocks import train_blocks as schedule
+from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute import Slurm, slurm
 from surfkit.runs.execute.base import LOG, Job
+from surfkit.runs.execute.block_state import read_state
 from surfkit.runs.execute.remote import RemoteJob
-from surfkit.runs.execute.state import read_state
 from surfkit.runs.pipeline import run
 
 submitit = needs("submitit", "executor:slurm")
@@ -123,7 +123,7 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
     """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
     reached, command, tests = tmp_path / "reached", schedule.job_of, str(Path(__file__).parents[2])
     code = (
-        f"import sys, surfkit.runs.stage as o\nsys.path[:0] = {[tests]}\n"
+        f"import sys, surfkit.runs.run_stage as o\nsys.path[:0] = {[tests]}\n"
         "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
         f"            await_sigterm(Path({str(reached)!r}))\n"

@@ -17,7 +17,7 @@ from surfkit.core.registry import plugins
 from surfkit.core.schedule import Steps
 from surfkit.core.tree import evolve
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.splats.ply import read_splats
 from surfkit.mesh.fusion import TILES_PATTERN
@@ -26,11 +26,11 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import QuantileGrid
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
-from surfkit.runs.methods.stereo import StereoFusion
+from surfkit.runs.methods.stereo_fusion import StereoFusion
 from surfkit.runs.pipeline import run, with_steps
 from surfkit.runs.recipe import Recipe
 from surfkit.study.ablation import Row, Table, build
-from surfkit.study.recipes.surface import STEREO, SURFACE
+from surfkit.study.recipes.surface_recipes import STEREO, SURFACE
 from surfkit.study.study import AblationPlan, ablate, trials
 from surfkit.testing import check_method
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

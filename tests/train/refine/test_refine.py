@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from surfkit.appearance import Exposure
-from surfkit.apps.result import result_rows
+from surfkit.apps.run_summary import result_rows
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import components
@@ -21,20 +21,21 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
-from surfkit.runs import measure, pipeline
-from surfkit.runs.blocks.schedule import Compute
+from surfkit.runs import measure_run as measure
+from surfkit.runs import pipeline
+from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import load_run, run, with_steps
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.stage import Intervals, drawing, return_to_checkpoint
-from surfkit.runs.status import status
+from surfkit.runs.run_stage import Intervals, drawing, return_to_checkpoint
+from surfkit.runs.run_status import status
 from surfkit.study.recipes.city import CITY_FIRST
 from surfkit.testing import check_refine
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.faults import Diverged, NotFinite
 from surfkit.train.refine import DistilSH, PruneAndRecover, Refine
-from surfkit.train.refine.light import DISTILLATION, RECOVERY
+from surfkit.train.refine.light_gaussian import DISTILLATION, RECOVERY
 from surfkit.train.stage import Stage
 
 EVERY = Intervals(checkpoint=2, pictures=0)

@@ -1,7 +1,7 @@
 import pytest
 from surfkit.plugin import BadInput
 from surfkit.testing import check
-from surfkit.testing.files import splat_table
+from surfkit.testing.format_checks import splat_table
 
 from new_plugin.new_part import NewPart
 

@@ -1,0 +1,270 @@
+"""All maps of a mesh, from the settings of a user to a folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from surfkit.apps.maps.cloud import write_cloud
+from surfkit.apps.maps.contours import even_interval, write_contours
+from surfkit.apps.maps.difference import Difference, draw_difference, write_difference
+from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
+from surfkit.apps.maps.hillshade import draw_hillshade
+from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
+from surfkit.apps.maps.orthophoto import OrthophotoColors
+from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
+from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
+from surfkit.apps.texture.resolution import ground_sampling_distance
+from surfkit.apps.texture.texture_cache import TextureCache, identity, seen
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.core.events import FileWritten, Warned, emit
+from surfkit.core.optional import needed
+from surfkit.core.stages import key_of
+from surfkit.core.version import own_version
+from surfkit.evaluate.geometry.surface_file import SurfaceFile
+from surfkit.mesh.simplify import require_simplification
+from surfkit.scene.available_memory import cache_bytes
+from surfkit.scene.crop import Axis
+from surfkit.scene.lengths import Length, unit_of
+from surfkit.scene.up_direction import map_axes, up_direction
+
+Product = Literal["orthophoto", "hillshade", "contours", "points"]
+PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
+COMPARISON_FILES = ("other", "difference", "picture")
+"""Files of a comparison."""
+PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
+"""What products need beside rasterio."""
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """What is drawn, and how."""
+
+    products: tuple[Product, ...] = PRODUCTS
+    """What to write beside the surface model (dsm.tif)."""
+
+    gsd: Length = "auto"
+    """Side of a cell (ground sampling distance), metres; in units of the data set where it does not say how long these
+    are. `auto` is what a pixel of the photographs covers at its median depth."""
+
+    bounds: tuple[float, float, float, float] | None = None
+    """Draw only this part: west south east north, in coordinates of the map. Default: the whole mesh."""
+
+    interval: Length = "auto"
+    """Between contour lines, like --gsd. `auto` is 1, 2 or 5 times a power of ten that gives at most 20 levels."""
+
+    spacing: Length = "auto"
+    """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is that
+    of --gsd."""
+
+    up: Axis | None = None
+    """Axis of the data set that points up. Default: z if it is georeferenced, else what the cameras tell."""
+
+    tile: int = 2048
+    """Side of the tiles that are drawn at once, pixels. Rasters do not depend on it; contour lines are cut where tiles
+    meet."""
+
+    colors: Literal["photographs", "mesh"] = "mesh"
+    """Of the orthophoto: those of the photographs, one for each place, or those of the vertices of the mesh, which are
+    means of photographs or of renders."""
+
+    memory: str = "auto"
+    """Memory for photographs, such as 4GB, with --colors photographs; auto is half of the free memory."""
+
+    def __post_init__(self) -> None:
+        cache_bytes(self.memory, "--memory")
+        if self.colors == "photographs" and "orthophoto" not in self.products:
+            raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
+        for name in ("gsd", "interval", "spacing"):
+            value = getattr(self, name)
+            if value != "auto" and not 0 < value < float("inf"):
+                raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0, or auto")
+        if not 16 <= self.tile <= 16384:
+            raise BadInput(f"--tile {self.tile}: give 16 to 16384 pixels")
+        if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
+            raise BadInput("--bounds: give west south east north, with west below east and south below north")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the products, the surface model first."""
+        return ("dsm", *(name for name in PRODUCTS if name in self.products))
+
+    def refuse_missing(self) -> None:
+        """BadInput if a package is missing, before anything is done."""
+        for name in self.names:
+            for package in ("rasterio", *PRODUCT_PACKAGES.get(name, ())):
+                with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
+                    __import__(package)
+        if self.colors == "photographs":
+            require_simplification("simplifying a mesh")
+
+
+def make_maps(
+    subject: MeshWithPhotos, settings: MapSettings, out: Path, other: SurfaceFile | None = None
+) -> dict[str, Any]:
+    """Write the maps of a mesh into a folder, and return what maps.json says: lengths are in units of the input.
+
+    Args:
+        subject: What to draw.
+        settings: How.
+        out: The folder; maps of surfkit in it are replaced, all other files stay. What an interrupted call has finished
+            for the same maps is in it, and is not done again.
+        other: A mesh in the same coordinates, to subtract.
+
+    Raises:
+        BadInput: A package is missing, there is nothing to draw, or the map would be too large.
+        OSError: There are files of the names of the maps that surfkit did not write.
+    """
+    settings.refuse_missing()
+    frame, surface = subject.frame, subject.surface
+    crs, told = map_crs(frame)
+    up = up_direction(settings.up, subject.views, frame, np.eye(4))
+    grid = grid_of(subject, settings, map_axes(up.direction))
+    if settings.bounds is not None:
+        refuse_apart(surface, grid)
+    if other is not None:
+        refuse_apart(other, grid)
+    done, unit = drawable(surface, settings), unit_of(frame)
+    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()))]
+    key = key_of(
+        replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
+        grid.gsd, grid.bounds, identity(surface), other and identity(other),
+        seen(subject.views) if settings.colors == "photographs" else "",
+    )  # fmt: skip
+    with workshop(out, (*files, MAPS_RECORD), key) as folder:
+        replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
+        sheet = GeoTiffSettings(grid, crs, folder, out, needs_double(surface, grid), replaced)
+        drawn = SurfaceModelStats(**sheet.once(
+            [PRODUCT_FILES[name] for name in ("dsm", "orthophoto") if name in done],
+            lambda: asdict(draw(subject, settings, sheet, PRODUCT_FILES["orthophoto"] in files)),
+        ))  # fmt: skip
+        record = {
+            "mesh": str(surface.path),
+            "crs": frame.crs,
+            "coordinates": told,
+            "up": up.source,
+            "axes": grid.turn.tolist(),
+            "metres_per_unit": frame.metres,
+            "unit": unit,
+            "gsd": grid.gsd,
+            "bounds": list(grid.bounds),
+            "size": [grid.width, grid.height],
+            "covered": round(drawn.covered / (grid.width * grid.height), 6),
+            "heights": [drawn.lowest, drawn.highest],
+        }
+        if "orthophoto" in done and settings.colors == "photographs":
+            record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
+        record |= draw_products(subject, settings, sheet, drawn, done)
+        if other is not None:
+            record["difference"] = subtract(sheet, other, settings.tile, unit)
+        record["files"] = files
+        write_json(out / MAPS_RECORD, record)
+        emit(FileWritten(out / MAPS_RECORD, "facts of the maps"))
+    return record
+
+
+def draw(subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool) -> SurfaceModelStats:
+    """Draw the surface model, and the orthophoto if it is wanted."""
+    photographs = None
+    if colored and settings.colors == "photographs":
+        texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
+        made = textured(subject, TextureSettings(texel=texel), budget, TextureCache(sheet.folder))
+        photographs = OrthophotoColors(made, subject.frame, sheet, settings.tile)
+    colors = PRODUCT_FILES["orthophoto"] if colored else None
+    return draw_surface(subject.surface, sheet, settings.tile, PRODUCT_FILES["dsm"], colors, photographs)
+
+
+def grid_of(subject: MeshWithPhotos, settings: MapSettings, turn: np.ndarray) -> MapGrid:
+    """The cells of the maps; `turn` is (3, 3), from the frame of the input to east, north and up."""
+    frame, surface = subject.frame, subject.surface
+    if settings.gsd == "auto":
+        gsd = ground_sampling_distance(surface, subject.views, frame)
+    else:
+        gsd = settings.gsd / (frame.metres or 1.0)
+    return MapGrid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+
+
+def refuse_apart(surface: SurfaceFile, grid: MapGrid) -> None:
+    """BadInput for a mesh that lies beside the cells, before maps that are there are replaced."""
+    west, south, east, north = found = bounds_of(surface, grid.turn)
+    borders = grid.bounds
+    if west > borders[2] or east < borders[0] or south > borders[3] or north < borders[1]:
+        raise BadInput(
+            f"{surface.path}: it lies within {shown(found)} (west south east north), and the maps within "
+            f"{shown(borders)}: not in the same place"
+        )
+
+
+def drawable(surface: SurfaceFile, settings: MapSettings) -> tuple[str, ...]:
+    """Names of the products, but for an orthophoto that would have no colours, which a warning tells."""
+    if "orthophoto" not in settings.names or settings.colors == "photographs" or has_colors(surface):
+        return settings.names
+    emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
+    return tuple(name for name in settings.names if name != "orthophoto")
+
+
+def draw_products(
+    subject: MeshWithPhotos,
+    settings: MapSettings,
+    sheet: GeoTiffSettings,
+    drawn: SurfaceModelStats,
+    done: Sequence[str],
+) -> dict[str, Any]:
+    """Draw what follows from the surface model, and return what maps.json says of it."""
+    record: dict[str, Any] = {}
+    units = subject.frame.metres or 1.0
+    if "hillshade" in done:
+        sheet.once([PRODUCT_FILES["hillshade"]], lambda: shade(sheet, settings.tile))
+    if "contours" in done:
+        given = settings.interval
+        interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
+        record["contours"] = sheet.once([PRODUCT_FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
+    if "points" in done:
+        spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
+        record["points"] = sheet.once([PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
+    return record
+
+
+def shade(sheet: GeoTiffSettings, side: int) -> dict[str, Any]:
+    """Draw the hillshade; there is nothing to tell of it."""
+    draw_hillshade(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["hillshade"], side)
+    return {}
+
+
+def trace(sheet: GeoTiffSettings, interval: float, side: int) -> dict[str, Any]:
+    """Write the contour lines, and return what maps.json says of them."""
+    return {
+        "interval": interval,
+        "lines": write_contours(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["contours"], interval, side),
+    }
+
+
+def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float) -> dict[str, Any]:
+    """Write the point cloud, and return what maps.json says of it."""
+    return {"spacing": spacing, "points": write_cloud(surface, sheet, PRODUCT_FILES["points"], spacing)}
+
+
+def subtract(sheet: GeoTiffSettings, other: SurfaceFile, side: int, unit: str) -> dict[str, Any]:
+    """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
+    sheet.once([PRODUCT_FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, PRODUCT_FILES["other"])))
+    heights = sheet.out / PRODUCT_FILES["dsm"], sheet.out / PRODUCT_FILES["other"]
+    name = PRODUCT_FILES["difference"]
+    found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
+    claim(sheet.out, PRODUCT_FILES["picture"])
+    draw_difference(sheet.out / PRODUCT_FILES["picture"], sheet.out / name, found, unit)
+    return {"other": str(other.path), **asdict(found)}
+
+
+def bounds_of(surface: SurfaceFile, turn: np.ndarray) -> tuple[float, float, float, float]:
+    """West, south, east and north of the vertices of a mesh."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for block in surface.blocks():
+        placed = (block @ turn.T)[:, :2] if len(block) else np.empty((0, 2))
+        low, high = np.minimum(low, placed.min(0, initial=np.inf)), np.maximum(high, placed.max(0, initial=-np.inf))
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

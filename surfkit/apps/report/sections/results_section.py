@@ -1,0 +1,56 @@
+"""The figures of each run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surfkit.apps.report.elements import Section, TableCell, TableElement
+from surfkit.apps.report.json_values import QUANTITIES, number, numeric, of_metrics, plain, value_at
+from surfkit.apps.report.run_files import RunFiles
+
+SEAM_PARTS = {"near": "near block borders", "elsewhere": "away from block borders"}
+
+
+def results(runs: Sequence[RunFiles]) -> Section:
+    """All figures of one run, or the runs as rows with their differences to the first one."""
+    measured = [figures(run) for run in runs]
+    names = [name for name in QUANTITIES if any(name in one for one in measured)]
+    if len(runs) == 1:
+        rows = [plain(QUANTITIES[name].label, QUANTITIES[name].shown(measured[0][name])) for name in names]
+        table = TableElement("Figures of the run", ("quantity", "value"), (*rows, *_parts(runs[0])))
+        return Section("results", "Results", (table,))
+    rows = [
+        (TableCell(run.name, at, link=run.id("provenance")), *(_cell(one, name, measured[0], at) for name in names))
+        for at, (run, one) in enumerate(zip(runs, measured, strict=True))
+    ]
+    caption = f"Figures of the runs, with the differences to {runs[0].name}"
+    head = ("run", *(QUANTITIES[name].label for name in names))
+    return Section("results", "Results", (TableElement(caption, head, tuple(rows), is_sortable=True),))
+
+
+def figures(run: RunFiles) -> dict[str, float]:
+    """What was measured of a run, by the names in `QUANTITIES`; the size is that of its point_cloud.ply."""
+    found = {name: of_metrics(run.metrics, name) for name in QUANTITIES if name != "bytes"}
+    cloud = run.out / "point_cloud.ply"
+    found["bytes"] = float(cloud.stat().st_size) if cloud.is_file() else None
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _cell(one: dict[str, float], name: str, first: dict[str, float], at: int) -> TableCell:
+    value, what = one.get(name), QUANTITIES[name]
+    has_base = at > 0 and name in first and value is not None
+    note = what.difference(value, first[name]) if has_base else ""
+    return numeric(value, "" if value is None else what.shown(value), note)
+
+
+def _parts(run: RunFiles) -> list[tuple[TableCell, ...]]:
+    """PSNR of parts of the photographs that `surfkit evaluate --seen --seams` has measured."""
+    found = []
+    by_views = value_at(run.metrics, "images", "seen", "by_views")
+    for least in by_views if isinstance(by_views, dict) else ():
+        if (psnr := number(by_views, least, "psnr")) is not None:
+            found.append(plain(f"PSNR where {least} or more training views see the surface, dB", f"{psnr:.2f}"))
+    for part, words in SEAM_PARTS.items():
+        if (psnr := number(run.metrics, "images", "seams", part, "psnr")) is not None:
+            found.append(plain(f"PSNR {words}, dB", f"{psnr:.2f}"))
+    return found

@@ -1,0 +1,135 @@
+"""Meshes that other programs have made of the same photographs, as rows of an ablation table."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.runs.folder import note_metrics
+from surfkit.study.ablation import Row, Table
+from surfkit.study.row_comparison import compared, surface_figures
+from surfkit.study.rows import TrialResult
+from surfkit.study.truth import Truth
+
+MESHES_FOLDER = "meshes"
+"""In that of a table: what was measured of meshes of other programs."""
+GROUP = "Other programs"
+"""Heading of the part of a table that has them."""
+
+
+@dataclass(frozen=True)
+class OtherMesh:
+    """A mesh in the frame of the photographs.
+
+    Attributes:
+        label: Its name in the table: the program, with its version.
+        path: A file that `surfkit evaluate` takes.
+    """
+
+    label: str
+    path: Path
+
+    @classmethod
+    def parsed(cls, word: str) -> OtherMesh:
+        """Of LABEL=FILE.
+
+        Raises:
+            BadInput: It is not that.
+        """
+        label, sign, path = word.partition("=")
+        if not sign or not label.strip() or not path:
+            raise BadInput(f"--meshes {word}: give LABEL=FILE, such as OpenMVS=scene_mesh.ply")
+        return cls(label.strip(), Path(path))
+
+    def refuse_unusable(self) -> None:
+        """BadInput for what is no mesh."""
+        if read_surface(self.path).faces is None:
+            raise BadInput(f"--meshes {self.label}: {self.path} is a cloud of points; name a mesh")
+
+    def folder(self, truth: Truth, out: Path) -> Path:
+        """Where its measurements are kept; of another file, or of another truth, they lie elsewhere."""
+        state = self.path.stat()
+        made = f"{self.path.resolve()} {state.st_size} {state.st_mtime_ns} {truth.path} {truth.tau} {truth.stamp}"
+        return out / MESHES_FOLDER / hashlib.sha256(made.encode()).hexdigest()[:12]
+
+    def measure(self, truth: Truth, data: Data, out: Path) -> None:
+        """Compare it with the truth as the meshes of all rows are, in the same volume, and keep what came out.
+
+        Raises:
+            BadInput: It is nowhere near the truth, or one of the two cannot be used.
+        """
+        folder = self.folder(truth, out)
+        note_metrics(folder / "metrics.json", truth.compare(self.path, folder / "geometry", out, read(data)))
+
+    def figures(self, truth: Truth, out: Path) -> dict[str, float] | None:
+        """Its numbers, by the names of columns; None before it was measured."""
+        path = self.folder(truth, out) / "metrics.json"
+        if not path.exists():
+            return None
+        metrics = read_json(path, dict[str, Any])
+        found = surface_figures(metrics.get("geometry") or {}, metrics.get("mesh") or {})
+        return {name: float(value) for name, value in found.items() if value is not None}
+
+
+def measured_mesh(mesh: OtherMesh, truth: Truth, data: Data, out: Path) -> TrialResult:
+    """The numbers of a mesh, which is measured if it was not yet, or why it could not be."""
+    try:
+        if mesh.figures(truth, out) is None:
+            mesh.measure(truth, data, out)
+        return TrialResult(mesh.figures(truth, out))
+    except BadInput as error:
+        return TrialResult(failed=" ".join(str(error).split()))
+
+
+def refuse_unfit(meshes: Sequence[OtherMesh], table: Table, data_sets: int, has_truth: bool) -> None:
+    """BadInput for meshes that cannot be rows of a table: without a truth, of several data sets, or named twice."""
+    if meshes and not has_truth:
+        raise BadInput("--meshes: they are compared with the truth; name it with --gt")
+    if meshes and data_sets != 1:
+        raise BadInput(f"--meshes: they are of one data set, and --data names {data_sets}; give a command for each")
+    taken = [row.label for row in table.rows]
+    for mesh in meshes:
+        if mesh.label in taken:
+            raise BadInput(f"--meshes {mesh.label}: table:{table.name} has such a row already; choose another label")
+        if not mesh.path.is_file():
+            raise BadInput(f"--meshes {mesh.label}: {mesh.path}: no such file; name a mesh")
+        taken.append(mesh.label)
+
+
+def mesh_rows(
+    meshes: Sequence[OtherMesh], truth: Truth, out: Path, outcomes: Mapping[Path, TrialResult], before: int
+) -> list[dict[str, Any]]:
+    """Plain data of the rows of meshes, as those of a table are.
+
+    Args:
+        meshes: In their order.
+        truth: What they are compared with.
+        out: Folder of the table.
+        outcomes: Of those that were measured now, by their folders.
+        before: Rows above.
+    """
+    rows = []
+    for at, mesh in enumerate(meshes):
+        found = mesh.figures(truth, out)
+        row = Row(mesh.label, group="" if at else GROUP)
+        folder = mesh.folder(truth, out)
+        rows.append(
+            compared(before + at + 1, row, None, {} if found is None else {mesh.label: {0: found}})
+            | {
+                "runs": []
+                if found is None
+                else [{"seed": None, "folder": folder.relative_to(out).as_posix(), **found}],
+                "failed": outcomes.get(folder, TrialResult()).failed,
+                "not_as_named": None,
+                "file": str(mesh.path),
+            }
+        )
+    return rows
