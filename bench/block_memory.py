@@ -32,14 +32,14 @@ MAKE = """
 import sys, torch
 from dataclasses import replace
 from pathlib import Path
-from surfkit.runs.blocks.block import Record, load_blocks
+from surfkit.runs.blocks.block import BlocksRecord, load_blocks
 from surfkit.runs.blocks.train_blocks import extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.runs.folder import Run
 from surfkit.runs.run_stage import Intervals
 from surfkit.partition import CoarseModel, QuantileGrid
-from surfkit.partition.plan import Plan, blocks_of
+from surfkit.partition.plan import PartitionPlan, blocks_of
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.io.datasets.data import Data
@@ -48,7 +48,7 @@ from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
-from surfkit.train.view_order import Order
+from surfkit.train.view_order import ViewOrder
 from surfkit.runs.context import RunContext
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
@@ -57,15 +57,15 @@ stage = Stage(steps=steps, densify=None, sh_every=1)
 recipe = replace(recipes()["2dgs"], pretrain=stage, tune=stage, partition=QuantileGrid((across, across)), mesh=None)
 this, scene = Run(out, recipe, data), read(data)
 params = recipe.primitive.init(scene.cloud, torch.Generator().manual_seed(0))
-state = StageState(Points.fresh(params), Order(len(scene.train)), torch.Generator(), index=steps, sh_degree=3)
+state = StageState(Points.fresh(params), ViewOrder(len(scene.train)), torch.Generator(), index=steps, sh_degree=3)
 checkpoint.save(this.pretrain.checkpoint, state)
 sight = CoarseModel(recipe.primitive.activate(params, 0), scene.train, select("cpu")[0], stage.near)
 cells = recipe.partition.cells(sight)
 inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
 write_json(out / "recipe.json", recipe)
 write_json(out / "run.json", {"data": data})
-plan = Plan(cells, blocks_of(sight, cells, inside, inside))
-write_json(out / "blocks" / "plan.json", Record(steps, plan))
+plan = PartitionPlan(cells, blocks_of(sight, cells, inside, inside))
+write_json(out / "blocks" / "plan.json", BlocksRecord(steps, plan))
 extract_views(RunContext(this, scene, sight.rasterizer, Intervals(), CacheSettings()), load_blocks(this, plan))
 """
 
@@ -81,7 +81,7 @@ from surfkit.io.datasets.read import read
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.state import StageState
-from surfkit.train.view_order import Order
+from surfkit.train.view_order import ViewOrder
 from surfkit.runs.run_stage import Intervals
 from surfkit.runs.blocks.worker import Start
 from surfkit.runs.context import RunContext
@@ -94,7 +94,7 @@ for block in load_blocks(this, read_plan(this).plan):
     begun = Start(ctx, block, views)()
     steps = this.recipe.tune.steps
     points, degree = Points.fresh(begun.params), begun.sh_degree
-    state = StageState(points, Order(len(views)), torch.Generator(), index=steps, sh_degree=degree)
+    state = StageState(points, ViewOrder(len(views)), torch.Generator(), index=steps, sh_degree=degree)
     checkpoint.save(block.stage.checkpoint, state)
     block.write(status="done", step=steps, steps=steps)
 """

@@ -33,7 +33,8 @@ from surfkit.runs.blocks.worker import open_coarse_model
 from surfkit.runs.context import RunContext
 from surfkit.runs.execute import Pool
 from surfkit.runs.folder import Run
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_stage import Intervals
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View

@@ -24,7 +24,8 @@ from surfkit.cli.recipes import recipes
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.runs.blocks.train_blocks import Compute
-from surfkit.runs.pipeline import Intervals, run, with_steps
+from surfkit.runs.pipeline import Intervals, run
+from surfkit.runs.recipe import with_steps
 from surfkit.train.data_cache import CacheSettings
 
 TIMES = ("seconds", "cpu_seconds")

@@ -22,7 +22,8 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.io.datasets.data import Data
 from surfkit.runs.blocks.train_blocks import Compute
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_stage import Intervals
 
 

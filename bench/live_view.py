@@ -35,7 +35,8 @@ from surfkit.cli.recipes import recipes
 from surfkit.io.datasets.data import Data
 from surfkit.primitives.points import Points
 from surfkit.runs.blocks.train_blocks import Compute
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import TrainingDisplay

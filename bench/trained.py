@@ -11,8 +11,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.scene.photos import photo_cache
 from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer

@@ -99,7 +99,7 @@ def _contract(base: type) -> Iterator[str]:
     """A base class as Python: what a part inherits, the abstract methods before those that it may replace."""
     values: dict[str, list[str]] = {}
     methods: dict[str, list[str]] = {}
-    imports: dict[str, set[str]] = {"surfkit": {"Component"}}
+    imports: dict[str, set[str]] = {"surfkit.plugin": {"Component"}}
     for cls, node, text in _members(base):
         if isinstance(node, ast.AnnAssign):
             values[node.target.id] = ["    " + ast.unparse(node).replace("'", '"'), *_docstring(text, 4)]

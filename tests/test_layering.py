@@ -31,7 +31,7 @@ INSIDE = {
     "raster": ("native nvrtc", "."),
     "compress": (". levels",),
     "train": (".", "refine"),
-    "runs": ("execute methods", ".", "blocks", "pipeline status"),
+    "runs": ("execute methods", ".", "blocks", "pipeline run_status"),
     "study": (".", "recipes"),
     "apps": ("sfm doctor report render texture new", "maps view", "."),
 }

@@ -19,7 +19,7 @@ from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
-from surfkit.runs.recipe import Recipe, complete
+from surfkit.runs.recipe import Recipe, complete, with_steps
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.stage import Stage
 
@@ -78,7 +78,7 @@ def train(
         steps = chosen.start.usual_steps(count, torch_device(device).type == "cuda")
         if steps is not None:
             say(f"steps: {steps:,}, as there are {count:,} photographs to train on; steps= changes it")
-    chosen = chosen if steps is None else pipeline.with_steps(chosen, steps)
+    chosen = chosen if steps is None else with_steps(chosen, steps)
     with listening(on_step):
         pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache))
     return open_run(out, device=device)

@@ -51,7 +51,7 @@ class PreparePhotosCommand:
     another estimator makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
-    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH_FOLDER")]
+    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folder of photographs and videos, in folders inside it or not, or one video; nothing is written there."""
 
     out: Path | None = None

@@ -27,8 +27,8 @@ from surfkit.raster.select import Device
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute.base import Executor, Inline
 from surfkit.runs.folder import Run, read_data
-from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.recipe import Recipe, unused
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe, unused, with_steps
 from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals
 from surfkit.study.tensorboard import tensorboard
 from surfkit.train.data_cache import CacheSettings

@@ -14,7 +14,6 @@ from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import name_of
-from surfkit.core.schedule import rescale
 from surfkit.evaluate.metrics import read_metrics
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import observations, read
@@ -66,23 +65,7 @@ from surfkit.train.data_cache import CacheSettings, read_ahead
 from surfkit.train.faults import in_one_line
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.progress_bars import bars
-from surfkit.train.stage import MAX_STAGE_STEPS
 from surfkit.train.state import StageState
-
-
-def with_steps(recipe: Recipe, steps: int) -> Recipe:
-    """The recipe as a run of `steps` steps, every schedule scaled along."""
-    if not 1 <= steps <= MAX_STAGE_STEPS:
-        raise BadInput(f"--steps {steps}: give 1 to {MAX_STAGE_STEPS}")
-    if recipe.has_stages:
-        return rescale(recipe, steps / recipe.pretrain.steps)
-    name = f"method:{name_of(recipe.method)}"
-    if recipe.length is None:
-        raise BadInput(f"--steps {steps}: {name} makes no optimisation steps; leave it out")
-    scaled = replace(recipe, method=rescale(recipe.method, steps / recipe.length))
-    if scaled.length != steps:
-        raise BadInput(f"--steps {steps}: {name} does not scale its steps; set them among its own settings, --method.*")
-    return scaled
 
 
 def run(

@@ -14,6 +14,7 @@ from surfkit.compress.levels.base import LevelsOfDetail
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, components, name_of
+from surfkit.core.schedule import rescale
 from surfkit.depth.base import DepthEstimator
 from surfkit.io.datasets.data import TEST_EVERY
 from surfkit.losses.consensus import Consensus
@@ -28,7 +29,7 @@ from surfkit.runs.methods.splat_optimisation import SplatOptimisation
 from surfkit.start.base import Start
 from surfkit.start.simple_starts import SparseStart
 from surfkit.train.refine.base import Refine
-from surfkit.train.stage import Stage
+from surfkit.train.stage import MAX_STAGE_STEPS, Stage
 
 Context = Literal["densified", "tuned", "frozen"]
 """What becomes of the points around a block while it is tuned."""
@@ -277,3 +278,18 @@ def refuse_unused(recipe: Recipe) -> None:
 def unused(recipe: Recipe, setting: str) -> str:
     """What is said of a setting that the method does not use."""
     return f"{setting}: method:{name_of(recipe.method)} does not use it; leave it out, or choose method:splats"
+
+
+def with_steps(recipe: Recipe, steps: int) -> Recipe:
+    """The recipe as a run of `steps` steps, every schedule scaled along."""
+    if not 1 <= steps <= MAX_STAGE_STEPS:
+        raise BadInput(f"--steps {steps}: give 1 to {MAX_STAGE_STEPS}")
+    if recipe.has_stages:
+        return rescale(recipe, steps / recipe.pretrain.steps)
+    name = f"method:{name_of(recipe.method)}"
+    if recipe.length is None:
+        raise BadInput(f"--steps {steps}: {name} makes no optimisation steps; leave it out")
+    scaled = replace(recipe, method=rescale(recipe.method, steps / recipe.length))
+    if scaled.length != steps:
+        raise BadInput(f"--steps {steps}: {name} does not scale its steps; set them among its own settings, --method.*")
+    return scaled

@@ -11,8 +11,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import offered, offered_once, unknown
 from surfkit.core.schedule import rescale
 from surfkit.core.tree import evolve
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe, unused, without_unused
+from surfkit.runs.recipe import Recipe, unused, with_steps, without_unused
 from surfkit.study.metric_columns import TABLE_COLUMNS
 
 BASELINE = "Without splats"

@@ -16,7 +16,8 @@ from surfkit.io.splats.ply import write_points
 from surfkit.partition.base import Cells, Ground
 from surfkit.partition.plan import BlockPlan, PartitionPlan
 from surfkit.runs.blocks.train_blocks import BlocksRecord
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")

@@ -18,7 +18,8 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import map_path
 from surfkit.losses import DepthRegression
 from surfkit.runs import run_stage as stage
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 SMALL = ("estimator:plane-sweep", "--test-every", "4", "--estimator.longest", "48")

@@ -22,7 +22,8 @@ from surfkit.primitives import Surfel2D
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.compress_model import CompressionTarget, fitted, importance_of
 from surfkit.runs.folder import discard_results
-from surfkit.runs.pipeline import loaded, run, with_steps
+from surfkit.runs.pipeline import loaded, run
+from surfkit.runs.recipe import with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 COMPRESS = Vectree(ratio=0.5, codes=16)

@@ -18,7 +18,8 @@ from surfkit.io.datasets.data import Data
 from surfkit.raster.select import select
 from surfkit.runs import measure_run as measure
 from surfkit.runs import pipeline
-from surfkit.runs.pipeline import Intervals, run, with_steps
+from surfkit.runs.pipeline import Intervals, run
+from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_status import status
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

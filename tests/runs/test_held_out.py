@@ -17,8 +17,8 @@ from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.io.datasets.read import read
 from surfkit.runs import warn
 from surfkit.runs.folder import Run, read_data
-from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.study.ablation import Row, Table, with_changes
 from surfkit.study.study import fingerprint
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

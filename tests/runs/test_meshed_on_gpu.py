@@ -19,7 +19,8 @@ from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.compress_model import compress_run
 from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
-from surfkit.runs.pipeline import loaded, run, with_steps
+from surfkit.runs.pipeline import loaded, run
+from surfkit.runs.recipe import with_steps
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

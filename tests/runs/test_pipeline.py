@@ -26,8 +26,8 @@ from surfkit.runs import run_stage as stage
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.execute import Pool
 from surfkit.runs.folder import Run
-from surfkit.runs.pipeline import Intervals, load_run, run, with_steps
-from surfkit.runs.recipe import complete
+from surfkit.runs.pipeline import Intervals, load_run, run
+from surfkit.runs.recipe import complete, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.data_cache import CacheSettings
 

@@ -26,8 +26,8 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.losses.depth import DepthRegression
 from surfkit.runs import journal, pipeline
-from surfkit.runs.pipeline import Intervals, load_run, run, with_steps
-from surfkit.runs.recipe import complete
+from surfkit.runs.pipeline import Intervals, load_run, run
+from surfkit.runs.recipe import complete, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train import step as train_step

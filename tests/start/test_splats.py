@@ -17,7 +17,8 @@ from surfkit.io.splats.ply import read_splats, write_splats
 from surfkit.partition import QuantileGrid
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
-from surfkit.runs.pipeline import Intervals, load_run, run, with_steps
+from surfkit.runs.pipeline import Intervals, load_run, run
+from surfkit.runs.recipe import with_steps
 from surfkit.start.base import StartInput
 from surfkit.start.splat_start import SplatStart
 from surfkit.testing import check_start

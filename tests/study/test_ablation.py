@@ -16,8 +16,7 @@ from surfkit.densify.signal import LossGradient
 from surfkit.densify.trim import Trim
 from surfkit.losses.depth import DepthRegression
 from surfkit.partition.grid import ContractedGrid
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe, without_unused
+from surfkit.runs.recipe import Recipe, with_steps, without_unused
 from surfkit.study import ablation
 from surfkit.study.ablation import Row, Table, build, built_on, limit_points, offered_tables, pick, scaled
 from surfkit.study.metric_columns import MESH_COLUMNS, TABLE_COLUMNS

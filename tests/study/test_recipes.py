@@ -18,7 +18,8 @@ from surfkit.losses import L1, SSIM, DepthRegression, Distortion, NormalConsiste
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import ContractedGrid, QuantileGrid
 from surfkit.primitives import Gaussian3D, Surfel2D
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.train.stage import rates_of
 
 

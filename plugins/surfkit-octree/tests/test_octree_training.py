@@ -17,7 +17,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.plugin import Densify, LearningRate, Points, components
 from surfkit.raster.select import select
-from surfkit.runs.pipeline import with_steps
+from surfkit.runs.recipe import with_steps
 from surfkit.scene.photos import photo_cache
 from surfkit.start.base import StartInput
 from surfkit.testing.synthetic import Flight, photograph, write_colmap

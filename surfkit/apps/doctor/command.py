@@ -28,8 +28,7 @@ from surfkit.core.memory import size
 from surfkit.core.registry import name_of
 from surfkit.io.datasets.data import ReadSettings
 from surfkit.raster.select import Device
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, with_steps
 
 MAX_PROBED_STEPS, MAX_POINT_COUNT = 10_000, 2**31 - 1
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}

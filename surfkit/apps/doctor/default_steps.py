@@ -11,8 +11,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import say
 from surfkit.io.datasets.data import Data
 from surfkit.raster.select import Device, torch_device
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.train.stage import Stage
 
 

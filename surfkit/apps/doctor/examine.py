@@ -28,7 +28,8 @@ from surfkit.io.datasets.masks import empty_masks
 from surfkit.io.datasets.panoramas import CUBE_FACES, points_remedy, size_to_read, view_names, view_sizes
 from surfkit.io.datasets.panoramas import PANORAMAS_FOLDER as PANORAMAS
 from surfkit.io.datasets.raw_dataset import RawImage
-from surfkit.io.datasets.read import RANDOM_POINTS, check_size
+from surfkit.io.datasets.read import check_size
+from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.io.datasets.undistort import cache_folder, is_panorama, is_pinhole
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.connected_photos import groups_warning, untied_warning

@@ -11,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit, reading_again
@@ -29,7 +28,6 @@ from surfkit.io.datasets.panoramas import (
     cut,
     cut_tracks,
     parts_of,
-    points_remedy,
     size_to_read,
     view_names,
     view_sizes,
@@ -39,6 +37,7 @@ from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.record3d import PACKED_SUFFIX
 from surfkit.io.datasets.reduced import reduced
+from surfkit.io.datasets.sparse_points import sparse_points
 from surfkit.io.datasets.undistort import (
     DistortedPhoto,
     check_camera,
@@ -55,12 +54,10 @@ from surfkit.scene.decoded_photos import place
 from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.photo_names import PICTURE_SUFFIXES, VIDEO_SUFFIXES, is_video
 from surfkit.scene.photos import is_turned, photo_size, refuse_large
-from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
+from surfkit.scene.scene import Frame, Lens, Mask, Scene, View
 
 NO_NUMBER = 2**32 - 1
 """What pycolmap calls cameras of programs that do not number them."""
-RANDOM_POINTS = 50_000
-"""Where a data set has no sparse points."""
 
 
 def read(data: Data) -> Scene:
@@ -102,6 +99,7 @@ def _read_placed(data: Data, reader: Reader) -> RawDataset:
 
 def _placed(data: Data, reader: Reader) -> Georeference | None:
     """What the data set says of its place on the map; a model in a folder of its own has that file there."""
+    poses = np.stack([part.pose for shot in train for part in parts_of(shot)])
     return None if reader.model_folder(data) is not None else read_placed(data.path)
 
 
@@ -135,11 +133,12 @@ def build_scene(
     wanted = [shot for shot in shots if only is None or not only.isdisjoint(view_names([shot]))]
     views = _views(data, wanted, decided, masks, frame, keep, pixels)
     train = [shot for shot in shots if shot.name not in held_out]
+    trained = np.stack([part.pose for shot in train for part in parts_of(shot)])
     scene = Scene(
         name=data.path.resolve().name,
         train=tuple(view for shot, view in views if shot not in held_out),
         held_out=tuple(view for shot, view in views if shot in held_out),
-        cloud=_cloud(data.path, capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
+        cloud=sparse_points(data.path, capture, trained, frame),
         frame=frame,
     )
     for line in decided.lines:
@@ -385,22 +384,3 @@ def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
         return pixels / (lens.width, lens.height)
     rays = np.asarray(lens.cam_from_img(pixels), np.float64).reshape(-1, 2)
     return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
-
-
-def _cloud(path: Path, capture: RawDataset, poses: np.ndarray, frame: Frame) -> SparsePoints:
-    if len(capture.xyz):
-        xyz = frame.to_local(capture.xyz).astype(np.float32)
-        return SparsePoints(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
-    emit(
-        Warned(
-            f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
-            "cameras and of what lies before them, which takes longer and leaves more floaters; "
-            f"{points_remedy(path, view_names(capture.shots))}"
-        )
-    )
-    local = np.stack([frame.local_pose(pose).numpy() for pose in poses])
-    centres = -(local[:, :3, :3].transpose(0, 2, 1) @ local[:, :3, 3:])[..., 0]
-    corners = np.concatenate([centres, centres + local[:, 2, :3]])  # one extent ahead, along the optical axes
-    draw = np.random.default_rng(0)
-    xyz = draw.uniform(corners.min(0), corners.max(0), (RANDOM_POINTS, 3)).astype(np.float32)
-    return SparsePoints(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8), drawn=True)

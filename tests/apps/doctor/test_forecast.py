@@ -37,7 +37,8 @@ from surfkit.io.datasets.read import read
 from surfkit.losses import NormalPrior, Reprojection
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.runs.pipeline import Intervals, run, with_steps
+from surfkit.runs.pipeline import Intervals, run
+from surfkit.runs.recipe import with_steps
 from surfkit.scene.scene import SparsePoints
 from surfkit.study.recipes.surface_recipes import SURFACE
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu

@@ -11,8 +11,7 @@ from surfkit.cli.recipes import ARGV
 from surfkit.core.codec import dump
 from surfkit.io.datasets.data import Data
 from surfkit.runs.folder import Run
-from surfkit.runs.pipeline import with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.study.recipes.surface_recipes import SURFACE, SURFACE_SHORT
 
 WHOLE = 30_000

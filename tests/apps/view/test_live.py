@@ -37,7 +37,8 @@ from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps
 from surfkit.runs.blocks.train_blocks import Compute
-from surfkit.runs.pipeline import run, with_steps
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_stage import Intervals
 from surfkit.train import checkpoint
 from surfkit.train.refine import PruneAndRecover

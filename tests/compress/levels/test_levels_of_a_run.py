@@ -20,8 +20,8 @@ from surfkit.primitives import Surfel2D
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import discard_results
 from surfkit.runs.make_levels import load_levels, make_levels
-from surfkit.runs.pipeline import loaded, run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import loaded, run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 LOD = MergedLevels(tile_points=100, steps=4)

@@ -12,7 +12,8 @@ from data_set_folders import DEPTHS, FLIGHT, city, nerfstudio, renumbered, squar
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import read_priors
-from surfkit.io.datasets.read import RANDOM_POINTS, read
+from surfkit.io.datasets.read import read
+from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.io.datasets.split import GauUScene
 from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import SURFACES, Flight, look, photograph, write_colmap

@@ -12,7 +12,8 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.io.datasets import colmap
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.read import RANDOM_POINTS, read
+from surfkit.io.datasets.read import read
+from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.runs.run_notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 

@@ -10,7 +10,8 @@ from data_set_folders import FLIGHT, blender, lens, nerfstudio, odm, pixels_of, 
 
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
-from surfkit.io.datasets.read import RANDOM_POINTS, observations, read, read_capture, reader_of
+from surfkit.io.datasets.read import observations, read, read_capture, reader_of
+from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Mask

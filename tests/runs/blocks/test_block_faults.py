@@ -352,10 +352,10 @@ def test_two_drivers_in_one_folder(undisturbed, data, tmp_path, capsys):
     words = ["train", f"recipe:{undisturbed / 'recipe.json'}", "--data", str(data.path), "--out", str(out)]
     words += ["--device", "cpu", "--checkpoint-every", "3", "--pictures-every", "0"]
     halting = (
-        "import os, signal, sys, surfkit.runs.run_stage as o\nD = o.Display\n"
+        "import os, signal, sys, surfkit.runs.run_stage as o\nD = o.TrainingDisplay\n"
         "class Halting(D):\n    def show(self, done):\n        super().show(done)\n"
         "        if done.index == 3: os.kill(os.getpid(), signal.SIGSTOP)\n"
-        f"o.Display = Halting\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
+        f"o.TrainingDisplay = Halting\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
     driver = subprocess.Popen([sys.executable, "-c", halting], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:

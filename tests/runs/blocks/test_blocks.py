@@ -104,10 +104,10 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
         job = command(ctx, block, compute)
         if block.index == 0 and not (tmp_path / "killed").exists():
             code = (
-                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.TrainingDisplay\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(tmp_path / 'killed')!r}).touch(); os.kill(os.getpid(), 9)\n"
-                f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"
+                f"o.TrainingDisplay = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"
             )
             job = replace(job, command=("-c", code))
         return job

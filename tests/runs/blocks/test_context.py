@@ -134,10 +134,10 @@ def killed_in_block_1(monkeypatch):
         mark = ctx.run.out / "killed"
         if block.index == 1 and not mark.exists():
             code = (
-                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.runs.run_stage as o\nfrom pathlib import Path\nD = o.TrainingDisplay\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(mark)!r}).touch(); os.kill(os.getpid(), 9)\n"
-                f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"
+                f"o.TrainingDisplay = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"
             )
             job = replace(job, command=("-c", code))
         return job

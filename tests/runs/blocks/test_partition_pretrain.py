@@ -13,8 +13,8 @@ from surfkit.core.schedule import LearningRate
 from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
-from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 

@@ -14,7 +14,8 @@ from surfkit.runs.blocks import rounds, worker
 from surfkit.runs.blocks.block import BlockRun, agreement_file, read_plan, rounds_agreed
 from surfkit.runs.blocks.train_blocks import Compute, Unfinished
 from surfkit.runs.execute.base import Inline, JobResult
-from surfkit.runs.pipeline import opened, run, with_steps
+from surfkit.runs.pipeline import opened, run
+from surfkit.runs.recipe import with_steps
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 

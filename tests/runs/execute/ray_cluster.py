@@ -170,11 +170,11 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     tests = str(Path(__file__).parents[2])
     code = (
         f"import psutil, sys, surfkit.runs.run_stage as o\nsys.path[:0] = {[tests]}\n"
-        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
+        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.TrainingDisplay\n"
         f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if there and done.index == 7:\n"
         f"            await_sigterm(Path({str(reached)!r}))\n"
-        "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
+        "o.TrainingDisplay = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
     def lingering(ctx, block, compute):

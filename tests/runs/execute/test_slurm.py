@@ -124,10 +124,10 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
     reached, command, tests = tmp_path / "reached", schedule.job_of, str(Path(__file__).parents[2])
     code = (
         f"import sys, surfkit.runs.run_stage as o\nsys.path[:0] = {[tests]}\n"
-        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
+        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.TrainingDisplay\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
         f"            await_sigterm(Path({str(reached)!r}))\n"
-        "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
+        "o.TrainingDisplay = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
     def lingering(ctx, block, compute):

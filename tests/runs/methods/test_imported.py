@@ -21,8 +21,8 @@ from surfkit.io.splats.base import Format
 from surfkit.io.splats.ply import read_splats, write_splats
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.runs.methods.imported import SplatImport
-from surfkit.runs.pipeline import loaded, run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import loaded, run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.testing import check_method
 
 

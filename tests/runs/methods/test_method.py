@@ -27,8 +27,8 @@ from surfkit.partition import QuantileGrid
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.runs.methods.stereo_fusion import StereoFusion
-from surfkit.runs.pipeline import run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.study.ablation import Row, Table, build
 from surfkit.study.recipes.surface_recipes import STEREO, SURFACE
 from surfkit.study.study import AblationPlan, ablate, trials

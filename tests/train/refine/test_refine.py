@@ -25,8 +25,8 @@ from surfkit.runs import measure_run as measure
 from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
-from surfkit.runs.pipeline import load_run, run, with_steps
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.pipeline import load_run, run
+from surfkit.runs.recipe import Recipe, with_steps
 from surfkit.runs.run_stage import Intervals, drawing, return_to_checkpoint
 from surfkit.runs.run_status import status
 from surfkit.study.recipes.city import CITY_FIRST
