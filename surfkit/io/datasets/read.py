@@ -99,7 +99,6 @@ def _read_placed(data: Data, reader: Reader) -> RawDataset:
 
 def _placed(data: Data, reader: Reader) -> Georeference | None:
     """What the data set says of its place on the map; a model in a folder of its own has that file there."""
-    poses = np.stack([part.pose for shot in train for part in parts_of(shot)])
     return None if reader.model_folder(data) is not None else read_placed(data.path)
 
 
