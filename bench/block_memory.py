@@ -83,7 +83,7 @@ from surfkit.train.data_cache import CacheSettings
 from surfkit.train.state import StageState
 from surfkit.train.view_order import ViewOrder
 from surfkit.runs.run_stage import Intervals
-from surfkit.runs.blocks.worker import Start
+from surfkit.runs.blocks.worker import BlockStart
 from surfkit.runs.context import RunContext
 import torch
 
@@ -91,7 +91,7 @@ this = opened(Path(sys.argv[1]))
 ctx = RunContext(this, read(this.data), select("cpu")[0], Intervals(pictures=0), CacheSettings("100MB"))
 for block in load_blocks(this, read_plan(this).plan):
     views = tuple(view for view in ctx.scene.train if view.name in set(block.planned.views))
-    begun = Start(ctx, block, views)()
+    begun = BlockStart(ctx, block, views)()
     steps = this.recipe.tune.steps
     points, degree = Points.fresh(begun.params), begun.sh_degree
     state = StageState(points, ViewOrder(len(views)), torch.Generator(), index=steps, sh_degree=degree)
