@@ -7,6 +7,8 @@ from urllib.parse import urlencode, urlsplit
 
 from needs import needs
 
+PATIENCE_S = 240
+
 
 def wait_until(what):
     """Until `what()` is true. The runner of the tests ends one that hangs; the machine may be busy with others."""
@@ -63,7 +65,9 @@ class Browser:
 
     def wait_for(self, seen):
         """What `seen(self)` returns as soon as it is true, after messages that have come."""
+        end = time.monotonic() + PATIENCE_S
         while not (found := seen(self)):
+            assert time.monotonic() < end, f"not seen after {PATIENCE_S} s"
             try:
                 self._take(self.socket.recv(timeout=0.2))
             except TimeoutError:

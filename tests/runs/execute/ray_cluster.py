@@ -30,6 +30,7 @@ from surfkit.testing import check_executor
 
 ray = needs("ray", "executor:ray")
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+PATIENCE_S = 240
 SMALL = {"object_store_memory": 80_000_000, "memory": 2_000_000_000, "include_dashboard": False}
 
 
@@ -65,7 +66,9 @@ def job(folder: Path, index: int, code: str = "pass", **more) -> Job:
 
 
 def wait_for(what):
+    end = time.monotonic() + PATIENCE_S
     while not what():
+        assert time.monotonic() < end, f"not so after {PATIENCE_S} s"
         time.sleep(0.05)
 
 
@@ -117,9 +120,9 @@ def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
 
 def test_the_driver_is_killed(cluster, tmp_path):
     """Ray kills the agents of a driver that is gone; what works for them notices, and saves."""
-    tests, folder = str(Path(__file__).parents[2]), str(tmp_path)
+    folder, places = str(tmp_path), [str(Path(__file__).parents[up]) for up in (1, 2)]
     code = (
-        f"import sys; sys.path[:0] = {[tests]}\nfrom pathlib import Path\n"
+        f"import sys; sys.path[:0] = {places}\nfrom pathlib import Path\n"
         "from execute.ray_cluster import SAVING, job\n"
         "from surfkit.runs.execute import Ray\n"
         f"list(Ray(address={cluster.address!r}, cpus=1, memory_gb=0.1).run([job(Path({folder!r}), 0, SAVING)]))"
