@@ -33,8 +33,11 @@ from surfkit.core.hooks import LazyCommand, hookimpl
 from surfkit.core.registry import Component, choice, components, find, name_of
 from surfkit.core.schedule import Interval, LearningRate, StepCount, Steps, log_linear, rescale
 from surfkit.core.tree import evolve
-from surfkit.densify import ADC, AbsGradient, CountCap, MatchedADC
+from surfkit.densify.adc import ADC
 from surfkit.densify.base import Contribution, Densify, Filter, Policy, Prune, Signal, Step, Views, admitted
+from surfkit.densify.filters import CountCap
+from surfkit.densify.matched import MatchedADC
+from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.data import Data
@@ -46,33 +49,30 @@ from surfkit.io.datasets.split import Split
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.file_axes import FileAxes
 from surfkit.io.splats.splat_table import SplatTable, Tile
-from surfkit.losses import (
-    L1,
-    SSIM,
-    DepthRegression,
-    Distortion,
-    MeanOpacity,
-    MeanScale,
-    NormalConsistency,
-    Reprojection,
-    WarpedPatches,
-)
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
-from surfkit.mesh import TSDF
+from surfkit.losses.depth import DepthRegression
+from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.regularizers import MeanOpacity, MeanScale
+from surfkit.losses.reprojection import Reprojection
+from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.losses.warped_patches import WarpedPatches
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.isosurface import isosurface
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.trust import Trust
-from surfkit.partition import QuantileGrid
+from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import Assign
 from surfkit.partition.base import Cells, CoarseModel, Contraction, Ground, Partition
-from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
+from surfkit.partition.grid import QuantileGrid
 from surfkit.primitives.base import Primitive, harmonics, rotated
 from surfkit.primitives.columns import EXP, IDENTITY, SIGMOID, Activation, Column, standard_columns
 from surfkit.primitives.edit import Edit, NewPoints
+from surfkit.primitives.flat3d import Flat3D
+from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.init import SH_C0, facing, seeds
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
+from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.runs.execute.base import Executor, Job, JobResult

@@ -70,7 +70,7 @@ def surfkit_commands():
             "surfkit.apps.report.command", "Write a report of runs or of an ablation table as one HTML file."
         ),
         "import": LazyCommand(
-            "surfkit.apps.import",
+            "surfkit.apps.import_splats",
             "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
             memory_advice="smaller photographs (--longest, --scale) or mesh:none need less",
         ),

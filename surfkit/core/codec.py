@@ -65,7 +65,7 @@ def load(hint: Any, data: Any, at: str = "") -> Any:
         return {key: load(args[1], item, _join(at, key)) for key, item in data.items()}
     if isinstance(hint, type) and issubclass(hint, Component):
         return _load_component(hint, data, at)
-    if is_dataclass(hint):
+    if isinstance(hint, type) and is_dataclass(hint):
         return _load_dataclass(hint, data, at)
     return _load_scalar(hint, data, at)
 

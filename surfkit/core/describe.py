@@ -63,9 +63,12 @@ def _field_docs(cls: type) -> dict[str, str]:
     except (OSError, TypeError, SyntaxError):  # a class without source, as in a frozen program
         return {}
     found = {}
+    if not isinstance(body, ast.ClassDef):
+        return {}
     for field, text in zip(body.body, body.body[1:], strict=False):
-        named = isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if named and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+        if not (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)):
+            continue
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
             found[field.target.id] = " ".join(str(text.value.value).split())
     return found
 

@@ -33,23 +33,27 @@ class LazyCommand:
 
 
 class Hooks:
-    """What a plugin may implement; each function is marked with `hookimpl`."""
+    """What a plugin may implement; each function is marked with `hookimpl`. pluggy reads their signatures only."""
 
     @hookspec
     def surfkit_components(self) -> Mapping[str, type[Component]]:
         """Return the components this package offers, by the name users type."""
+        raise NotImplementedError
 
     @hookspec
     def surfkit_recipes(self) -> Mapping[str, Any]:
         """Return the recipes this package offers, by the name users type."""
+        raise NotImplementedError
 
     @hookspec
     def surfkit_tables(self) -> Mapping[str, Any]:
         """Return the ablation tables this package offers, by the name users type."""
+        raise NotImplementedError
 
     @hookspec
     def surfkit_rows(self) -> Mapping[str, Any]:
         """Return rows that this package adds to tables that are there, a sequence by the name of the table."""
+        raise NotImplementedError
 
     @hookspec
     def surfkit_commands(self) -> Mapping[str, type | LazyCommand]:
@@ -58,6 +62,7 @@ class Hooks:
         Each is a dataclass: its docstring and its fields are the help, and `run()` does the work and returns an exit
         status, or None for 0. Or it is a `LazyCommand`, which names the module that has it.
         """
+        raise NotImplementedError
 
     @hookspec
     def surfkit_event(self, event: Any) -> None:

@@ -302,13 +302,14 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
 
 @cache  # all offers are checked again at each look-up, thousands of times in a table of runs
 def _check_class(name: str, cls: type[Component]) -> None:
-    if "__dataclass_params__" not in vars(cls) or not cls.__dataclass_params__.frozen:
+    if "__dataclass_params__" not in vars(cls) or not vars(cls)["__dataclass_params__"].frozen:
         raise BadInput(f"{_where(cls)} must be a frozen dataclass to be offered as {name!r}")
-    if is_dataclass(cls) and any(field.name == "use" for field in fields(cls)):
+    settings = fields(cls)  # type: ignore[arg-type]  # a dataclass, as was just looked at
+    if any(field.name == "use" for field in settings):
         raise BadInput(f"{_where(cls)} has a setting named 'use', which saved recipes keep for the component's name")
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         raise BadInput(f"{_where(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
-    unset = [f.name for f in fields(cls) if f.init and f.default is MISSING and f.default_factory is MISSING]
+    unset = [f.name for f in settings if f.init and f.default is MISSING and f.default_factory is MISSING]
     if unset:
         raise BadInput(f"{_where(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part")
     try:

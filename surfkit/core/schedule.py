@@ -89,10 +89,10 @@ def _rescale(hint: Any, value: Any, factor: float, like: Any) -> Any:
     inner = _element_hints(hint, value)
     if isinstance(value, tuple):
         likes = like if isinstance(like, tuple) and len(like) == len(value) else [None] * len(value)
-        return tuple(_rescale(*pair, factor, other) for *pair, other in zip(inner, value, likes, strict=True))
+        return tuple(_rescale(kind, item, factor, other) for kind, item, other in zip(inner, value, likes, strict=True))
     if isinstance(value, dict):
-        likes = like if isinstance(like, dict) else {}
-        return {key: _rescale(inner[0], item, factor, likes.get(key)) for key, item in value.items()}
+        like_of = like if isinstance(like, dict) else {}
+        return {key: _rescale(inner[0], item, factor, like_of.get(key)) for key, item in value.items()}
     return value
 
 

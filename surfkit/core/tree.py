@@ -61,7 +61,7 @@ def _evolve(node: Any, path: list[str], depth: int, value: Any) -> Any:
         raise BadInput(f"{here} has no {name!r}; it has {', '.join(names) or 'no settings'}")
     changed = {name: _evolve(getattr(node, name), path, depth + 1, value)}
     try:
-        return replace(node, **changed)
+        return replace(node, **changed)  # type: ignore[type-var]  # is_dataclass is true of classes too
     except ValueError as error:
         raise BadInput(f"{'.'.join(path)}: {error}") from error
 

@@ -96,6 +96,7 @@ class ADC(Densify):
         if self.cull_screen > 0:
             torch.maximum(columns[SIZE_STAT], step.radii / step.image_px, out=columns[SIZE_STAT])
         if self.needs_absolute:
+            assert step.signed_norm is not None, "a trainer gives it to policies that need it"
             columns[SIGNED_STAT].add_(step.signed_norm)
 
     def edit(self, points: Points, step: Step) -> Edit | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -130,7 +130,8 @@ class Densify(Policy):
         It is used where memory has run out and where an ablation limits all rows alike, so the limit must hold. This
         default wraps the densifier; one with a limit of its own, which knows whom to prefer, lowers that.
         """
-        return find(Densify, "limited")(self, points)
+        limited: Any = find(Densify, "limited")  # type: ignore[type-abstract]
+        return limited(self, points)
 
 
 class Prune(Policy):

@@ -1,6 +1,9 @@
 """Loss terms, by the name users type."""
 
+from collections.abc import Mapping
+
 from surfkit.core.hooks import hookimpl
+from surfkit.core.registry import Component
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
@@ -12,7 +15,7 @@ from surfkit.losses.warped_patches import WarpedPatches
 
 
 @hookimpl
-def surfkit_components():
+def surfkit_components() -> Mapping[str, type[Component]]:
     return {
         "l1": L1,
         "ssim": SSIM,

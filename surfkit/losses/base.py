@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -69,9 +69,11 @@ def ignoring(maps: Maps, target: Target) -> tuple[Maps, Target]:
     prior = target.prior
     if prior is not None:
         names = ("inverse", "confidence", "normal")
-        known = {n: torch.where(keep, value, 0) for n in names if (value := getattr(prior, n)) is not None}
+        known: dict[str, Any] = {
+            n: torch.where(keep, value, 0) for n in names if (value := getattr(prior, n)) is not None
+        }
         prior = replace(prior, **known)
-    return held, replace(target, photo=torch.where(keep, target.photo, held.color.detach()), prior=prior)
+    return held, replace(target, photo=torch.where(keep, target.photo, held.need("color").detach()), prior=prior)
 
 
 class Loss(Component):

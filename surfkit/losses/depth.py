@@ -55,7 +55,7 @@ class DepthRegression(Loss):
             )
 
     @property
-    def reads(self) -> tuple[str, ...]:
+    def reads(self) -> tuple[str, ...]:  # type: ignore[override]  # it depends on a setting
         """The maps of the depth that is compared."""
         return ("median",) if self.depth == "median" else ("alpha", "depth")
 
@@ -63,7 +63,7 @@ class DepthRegression(Loss):
         return log_linear(self.start, self.end, index / steps)
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        depth = maps.median if self.depth == "median" else maps.expected_depth()
+        depth = maps.need("median") if self.depth == "median" else maps.expected_depth()
         prior = target.prior
         if prior is None:
             return 0 * depth.sum()

@@ -49,13 +49,14 @@ class NormalPrior(Loss):
         return log_linear(self.start, self.end, index / steps)
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
+        normal = maps.need("normal")
         if target.prior is None or target.prior.normal is None:
-            return 0 * maps.normal.sum()
-        estimated = target.prior.normal.to(maps.normal)
-        square = maps.normal.square().sum(0)
+            return 0 * normal.sum()
+        estimated = target.prior.normal.to(normal)
+        square = normal.square().sum(0)
         there = (square.detach() > MIN_NORMAL_LENGTH**2) & (estimated != 0).any(0)
-        weight = torch.where(there, target.prior.confidence * maps.alpha.detach(), 0)
-        rendered = torch.where(there, maps.normal, 0) * torch.where(there, square, 1).rsqrt()
+        weight = torch.where(there, target.prior.confidence * maps.need("alpha").detach(), 0)
+        rendered = torch.where(there, normal, 0) * torch.where(there, square, 1).rsqrt()
         error = torch.zeros_like(square)
         if self.error != "l1":
             error = error + 1 - (rendered * estimated).sum(0)

@@ -22,7 +22,7 @@ class L1(Loss):
         return self.weight
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        return (maps.color - target.photo).abs().mean()
+        return (maps.need("color") - target.photo).abs().mean()
 
 
 @dataclass(frozen=True)
@@ -36,4 +36,4 @@ class SSIM(Loss):
         return self.weight
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        return 1 - ssim(maps.color, target.photo)
+        return 1 - ssim(maps.need("color"), target.photo)

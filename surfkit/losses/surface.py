@@ -40,7 +40,7 @@ class NormalConsistency(Loss):
     a depth prior, all pixels count."""
 
     @property
-    def needs_prior(self) -> bool:
+    def needs_prior(self) -> bool:  # type: ignore[override]  # it depends on a setting
         """Whether depth priors say where it counts."""
         return self.where == "unknown"
 
@@ -58,10 +58,10 @@ class NormalConsistency(Loss):
         return log_linear(self.weight, self.end, (index - self.start) / max(1, steps - self.start))
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        depth = maps.median if self.depth == "median" else maps.expected_depth()
+        depth = maps.need("median") if self.depth == "median" else maps.expected_depth()
         if self.where == "unknown" and target.prior is not None:
             depth = torch.where(target.prior.confidence < MIN_KNOWN_CONFIDENCE, depth, 0.0)
-        return disagreement(depth, maps.alpha, maps.normal, target.view.camera)
+        return disagreement(depth, maps.need("alpha"), maps.need("normal"), target.view.camera)
 
 
 @dataclass(frozen=True)
@@ -86,5 +86,7 @@ class Distortion(Loss):
         return self.weight if index > self.start else 0.0
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        spread = maps.distortion / (maps.alpha.square() + 1e-7) if self.normalise else maps.distortion
+        spread = maps.need("distortion")
+        if self.normalise:
+            spread = spread / (maps.need("alpha").square() + 1e-7)
         return spread.mean() * self.unit**2

@@ -57,8 +57,8 @@ class TwoViews:
 def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:
     """(H, W) camera z of the rendered surface; 0 where there is none."""
     if which == "median":
-        return maps.median
-    return torch.where(maps.alpha > MIN_SURFACE_ALPHA, maps.expected_depth(), 0.0)
+        return maps.need("median")
+    return torch.where(maps.need("alpha") > MIN_SURFACE_ALPHA, maps.expected_depth(), 0.0)
 
 
 def spread(size: tuple[int, int], side: int, seed: int, device: torch.device = CPU) -> tuple[Tensor, Tensor]:

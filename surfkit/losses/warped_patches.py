@@ -63,11 +63,12 @@ class WarpedPatches(TwoViews, Loss):
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth, camera, neighbour = surface_depth(maps, self.depth), target.view.camera, target.neighbour
-        nothing = 0 * (depth.sum() + maps.normal.sum())
+        normals = maps.need("normal")
+        nothing = 0 * (depth.sum() + normals.sum())
         at = self.centres(target)
         if neighbour is None or not len(at):
             return nothing
-        z, normal = depth.flatten()[at], maps.normal.flatten(1)[:, at]
+        z, normal = depth.flatten()[at], normals.flatten(1)[:, at]
         rays = camera.rays(depth.dtype, depth.device).flatten(1)[:, at]
         facing = -(normal * rays).sum(0) > MIN_VIEW_COSINE * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
         with torch.no_grad():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -163,9 +163,10 @@ class Primitive(Component):
                     f"primitive {kebab(type(self).__name__)}: PLY files of splats have no place for it, only for "
                     f"{'s and '.join(PRIMITIVE_KINDS)}s; the checkpoint in the run folder holds the model"
                 )
+            kind: Any = splats.kind  # one of these
             exact = "opacities" in params and torch.equal(SIGMOID.value(params["opacities"]), splats.opacities)
             return SplatTable(
-                kind=splats.kind,
+                kind=kind,
                 means=splats.means,
                 quats=splats.quats,
                 log_scales=splats.scales.log(),

@@ -90,6 +90,11 @@ class Column:
         if None in self.shape and not self.shared:
             raise BadInput(f"a column of points has shape {self.shape}; only that of a shared parameter may have None")
 
+    @property
+    def of_point(self) -> tuple[int, ...]:
+        """The sizes of `shape` that are known: for a column that is not shared, all of them."""
+        return tuple(size for size in self.shape if size is not None)
+
     def fits(self, shape: tuple[int, ...], points: int) -> bool:
         """Whether values of `shape` are those of so many points, or all values of a shared parameter."""
         wanted = self.shape if self.shared else (points, *self.shape)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,8 +99,8 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
             copies = _scattered(primitive, copies, points.shared, edit.scatter[rows], generator)
         added.append(copies)
     if edit.split is not None and edit.split.any():
-        rows = {name: value[edit.split] for name, value in points.params.items()}
-        added.append(primitive.split(rows | points.shared, generator))
+        parents = {name: value[edit.split] for name, value in points.params.items()}
+        added.append(primitive.split(parents | points.shared, generator))
         keep = ~edit.split
     if edit.new is not None and len(edit.new):
         added.append(edit.new.params)
@@ -186,7 +187,7 @@ def merge(edits: Sequence[Edit | None]) -> Edit | None:
     if not asked:
         return None
 
-    def given(name: str) -> list:
+    def given(name: str) -> list[Any]:
         return [value for edit in asked if (value := getattr(edit, name)) is not None]
 
     def most_of(name: str) -> Tensor | None:

@@ -46,7 +46,7 @@ def seeds(columns: Mapping[str, Column], cloud: SparsePoints) -> Columns:
         "sh_rest": torch.zeros(count, 1, 3),
     }
     return {
-        name: _spread(column.activation.inverse(activated[name]).float(), column.shape)
+        name: _spread(column.activation.inverse(activated[name]).float(), column.of_point)
         for name, column in columns.items()
         if name in activated
     }

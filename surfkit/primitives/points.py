@@ -32,9 +32,10 @@ class Points:
     @classmethod
     def fresh(cls, params: Columns, shared: Iterable[str] = ()) -> Points:
         """Points that have not been optimised yet; `shared` names the parameters that belong to no point."""
-        zeros = [{name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2)]
+        first, second = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
         common = {name: params[name] for name in shared}
-        return cls({name: value for name, value in params.items() if name not in common}, *zeros, shared=common)
+        own = {name: value for name, value in params.items() if name not in common}
+        return cls(own, first, second, shared=common)
 
     def __len__(self) -> int:
         return len(self.params["means"])

@@ -40,7 +40,7 @@ def raw_columns(what: str, columns: Mapping[str, Column], table: SplatTable) -> 
                 f"{what} cannot begin at the splats of a file, as it has no column {name!r} of "
                 f"{' or '.join(map(str, shapes))} values; it needs a `from_table` of its own, or choose another"
             )
-    axes, rest = columns["scales"].shape[0], columns["sh_rest"].shape[0] if "sh_rest" in columns else 0
+    axes, rest = columns["scales"].of_point[0], columns["sh_rest"].of_point[0] if "sh_rest" in columns else 0
     log_scales, quats = with_axes(table, axes)
     sh_rest = torch.nn.functional.pad(table.sh_rest[:, :rest], (0, 0, 0, max(0, rest - table.sh_rest.shape[1])))
     scales, opacities = columns["scales"].activation, columns["opacities"].activation

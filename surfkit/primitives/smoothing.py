@@ -36,7 +36,7 @@ class Smoothable:
     opacities fall so that a splat's integral over its axes stays the same. Files of splats hold what is drawn."""
 
     def __post_init__(self) -> None:
-        Primitive.__post_init__(self)
+        Primitive.__post_init__(self)  # type: ignore[arg-type]  # a class has both as bases
         if not 0 <= self.smoothing < float("inf"):
             raise BadInput(f"primitive.smoothing is {self.smoothing:g}; it must be 0 or more")
 
@@ -48,12 +48,12 @@ class Smoothable:
         """See `Primitive.with_opacities`: `opacities` are those after the filter, as far as there are such."""
         if self.smoothing:
             opacities = (opacities / self._kept(params).detach()).clamp_max(MAX_PREFILTER_OPACITY)
-        return Primitive.with_opacities(self, params, opacities)
+        return Primitive.with_opacities(self, params, opacities)  # type: ignore[arg-type]
 
     def smoothable_columns(self, axes: int) -> dict[str, Column]:
         """The standard columns, and the sampling intervals if scales are smoothed: (), local units, not trained."""
         added = {INTERVAL: Column((), LearningRate(0.0))} if self.smoothing else {}
-        return standard_columns(axes, self.sh_degree) | added
+        return standard_columns(axes, self.sh_degree) | added  # type: ignore[attr-defined]
 
     def unobserved(self, count: int) -> Columns:
         """The sampling intervals of new points, if scales are smoothed: 0, until `observed` knows better."""

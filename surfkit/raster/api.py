@@ -16,7 +16,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -120,14 +120,14 @@ class Splats:
 
     def with_named(self, tensors: Mapping[str, Tensor]) -> Splats:
         """The same kind of splats with other tensors, as `named` gives them."""
-        standard = {name: tensors[name] for name in STANDARD}
+        standard: dict[str, Any] = {name: tensors[name] for name in STANDARD}
         extra, shared = ({name: tensors[name] for name in group} for group in (self.extra, self.shared))
         return replace(self, **standard, extra=extra, shared=shared)
 
     def _with(self, change: Callable[[Tensor, Tensor], Tensor], others: Splats) -> Splats:
         """The same with each tensor of (N, ...) changed."""
         rest = others.tensors()
-        standard = {name: change(value, rest[name]) for name, value in self.tensors().items()}
+        standard: dict[str, Any] = {name: change(value, rest[name]) for name, value in self.tensors().items()}
         return replace(
             self, **standard, extra={name: change(value, others.extra[name]) for name, value in self.extra.items()}
         )
@@ -159,9 +159,17 @@ class Maps:
         """The maps that are there, by name."""
         return {f.name: v for f in fields(self) if (v := getattr(self, f.name)) is not None}
 
+    def need(self, name: str) -> Tensor:
+        """The map of this name; ValueError if it was not asked for."""
+        found: Tensor | None = getattr(self, name)
+        if found is None:
+            raise ValueError(f"the map {name!r} was not drawn; ask for it")
+        return found
+
     def expected_depth(self) -> Tensor:
         """(H, W) depth / alpha; 0 where alpha is 0."""
-        return torch.where(self.alpha > 0, self.depth / self.alpha.clamp_min(1e-10), 0.0)
+        alpha = self.need("alpha")
+        return torch.where(alpha > 0, self.need("depth") / alpha.clamp_min(1e-10), 0.0)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -117,7 +118,7 @@ class DerivedRender(Render):
         self.radii = radii.new_zeros(len(splats)).scatter_reduce(0, self._owner, radii, "amax")
 
     @property
-    def maps(self) -> Maps:  # type: ignore[override] (drawn when it is asked for)
+    def maps(self) -> Maps:  # type: ignore[override]  # drawn when it is asked for
         """See `Render`."""
         return self._inner.maps
 
@@ -163,4 +164,5 @@ def gathered(
     """Gradients by name as `Gradients`, of the first `rows` splats; of what is shared, all."""
     first = {name: value if name in shared else value[:rows] for name, value in grads.items()}
     extra = {name: value for name, value in first.items() if name not in STANDARD}
-    return replace(Gradients(*(first[name] for name in STANDARD), signal, chosen), extra=extra)
+    standard: dict[str, Any] = {name: first[name] for name in STANDARD}
+    return Gradients(**standard, signal=signal, chosen=chosen, extra=extra)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -28,7 +28,7 @@ class NativeRasterizer(Rasterizer):
 
     def title(self) -> str:
         """See `Rasterizer.title`."""
-        return f"cpu {native.module().kernels_in_use()}"
+        return f"cpu {native.kernels().kernels_in_use()}"
 
     def render(
         self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
@@ -38,7 +38,7 @@ class NativeRasterizer(Rasterizer):
     def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
         """See `Rasterizer.in_view`."""
         found = torch.empty(len(splats), dtype=torch.bool)
-        native.module().in_view(
+        native.kernels().in_view(
             splats.kind == "surfel",
             GEOMETRIES.index(splats.geometry),
             *(t.detach().to("cpu", torch.float32).contiguous() for t in (splats.means, splats.scales)),
@@ -79,7 +79,7 @@ class _Pass:
         self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         self.seen = torch.empty(len(splats), dtype=torch.bool)
         self.radii = torch.empty(len(splats), dtype=torch.float32)
-        self.native = native.module().Pass(
+        self.native = native.kernels().Pass(
             splats.kind == "surfel",
             GEOMETRIES.index(splats.geometry),
             self.arrays,
@@ -106,7 +106,7 @@ class NativeRender(Render):
         self._size, self._made = (camera.height, camera.width), made
 
     @cached_property
-    def maps(self) -> Maps:
+    def maps(self) -> Maps:  # type: ignore[override]  # drawn when it is asked for
         """See `Render`."""
         shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
         maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in self._made}
@@ -134,7 +134,8 @@ class NativeRender(Render):
             chosen_signal,
             torch.get_num_threads(),
         )
-        return Gradients(*grads, signal, chosen_signal)
+        standard: dict[str, Any] = dict(zip(STANDARD, grads, strict=True))
+        return Gradients(**standard, signal=signal, chosen=chosen_signal)
 
     def _cotangents(self, maps: Maps) -> list[Tensor | None]:
         given, drawn = maps.present(), self.maps

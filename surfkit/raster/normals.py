@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -45,7 +47,7 @@ def disagreement(depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -
         camera: That the maps were rendered for.
     """
     if native.module() is not None and depth.device.type == "cpu" and depth.dtype == torch.float32:
-        return _FusedNormals.apply(depth, alpha, normal, camera)
+        return _FusedNormals.apply(depth, alpha, normal, camera)  # type: ignore[no-untyped-call]
     return disagreement_reference(depth, alpha, normal, camera)
 
 
@@ -62,14 +64,14 @@ class _FusedNormals(torch.autograd.Function):
     """Value and gradients in one native pass."""
 
     @staticmethod
-    def forward(ctx, depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -> Tensor:
+    def forward(ctx: Any, depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -> Tensor:
         maps = [t.detach().contiguous() for t in (depth, alpha, normal)]
         ctx.gradients = (torch.empty_like(maps[0]), torch.empty_like(maps[2]))
         lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-        value = native.module().normal_disagreement(*maps, lens, *ctx.gradients, torch.get_num_threads())
+        value = native.kernels().normal_disagreement(*maps, lens, *ctx.gradients, torch.get_num_threads())
         return depth.new_tensor(value)
 
     @staticmethod
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None, Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, Tensor, None]:
         by_depth, by_normal = ctx.gradients
         return upstream * by_depth, None, upstream * by_normal, None

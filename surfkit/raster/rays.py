@@ -43,7 +43,7 @@ def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> 
         return ray_opacity_reference(splats, camera, near, points)
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities)
     opacity = torch.empty(len(points), dtype=torch.float32)
-    native.module().ray_opacity(
+    native.kernels().ray_opacity(
         [value.detach().to("cpu", torch.float32).contiguous() for value in arrays],
         camera.world_to_camera.double().flatten().tolist(),
         [camera.fx, camera.fy, camera.cx, camera.cy],
@@ -69,7 +69,7 @@ def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: T
     inside = ((z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)).nonzero()[:, 0]
     deep = (axes[:, 2] * splats.scales).square().sum(1) * CUTOFF**2
     there = (centre[:, 2] > near) & (deep < centre[:, 2] ** 2)
-    for rows in inside.split(max(1, BATCH_POINT_SPLATS // max(1, len(splats)))):
+    for rows in inside.split(max(1, BATCH_POINT_SPLATS // max(1, len(splats)))):  # type: ignore[no-untyped-call]
         ray = torch.stack(
             [(x[rows] - camera.cx) / camera.fx, (y[rows] - camera.cy) / camera.fy, torch.ones_like(z[rows])], 1
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -173,7 +174,7 @@ class Reference(Rasterizer):
         with torch.no_grad():
             prints = footprints(splats, camera, near)
             rows = prints.drawn.nonzero()[:, 0]
-            for some in inside.nonzero()[:, 0].split(TILE_SIDE_PX * TILE_SIDE_PX):
+            for some in inside.nonzero()[:, 0].split(TILE_SIDE_PX * TILE_SIDE_PX):  # type: ignore[no-untyped-call]
                 rho, depth, opacity = prints.at(rows, x[some], y[some], x.new_zeros(2))
                 alpha = (opacity * torch.exp(-rho / 2)).clamp_max(ALPHA_MAX)
                 found[some] = 1 - torch.where((alpha >= ALPHA_MIN) & (depth <= z[some]), 1 - alpha, 1.0).prod(0)
@@ -186,8 +187,9 @@ class ReferenceRender(Render):
     def __init__(self, splats: Splats, camera: Camera, near: float, left_out: set[str]) -> None:
         leaves = {name: value.detach().requires_grad_() for name, value in splats.tensors().items()}
         with torch.enable_grad():
-            form = splats.antialias, splats.dilation, splats.geometry
-            self._drawn = draw(Splats(splats.kind, *leaves.values(), *form), camera, near)
+            standard: dict[str, Any] = dict(leaves)
+            form: dict[str, Any] = {name: getattr(splats, name) for name in ("antialias", "dilation", "geometry")}
+            self._drawn = draw(Splats(splats.kind, **standard, **form), camera, near)
         self._leaves, self._camera = leaves, camera
         self._surfel = splats.kind == "surfel"
         self._half_image = torch.tensor([camera.width / 2, camera.height / 2]).to(splats.means)
@@ -207,8 +209,8 @@ class ReferenceRender(Render):
             part = self._scaled(self._sizes(chosen))
         elif chosen is not None:
             part = self._signal(self._pull(chosen, [self._drawn.footprints.screen])[0])
-        found = (*grads, self._signal(screen), part)
-        return Gradients(*(None if value is None else value[:rows] for value in found))
+        standard: dict[str, Any] = {name: value[:rows] for name, value in zip(self._leaves, grads, strict=True)}
+        return Gradients(**standard, signal=self._signal(screen)[:rows], chosen=None if part is None else part[:rows])
 
     def _pull(self, cotangents: Maps, wanted: list[Tensor]) -> list[Tensor]:
         given = cotangents.present()

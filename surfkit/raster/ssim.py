@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
@@ -21,9 +23,9 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
         y: (C, H, W) in [0, 1]; a constant.
     """
     if native.module() is not None and x.device.type == "cpu" and x.dtype == torch.float32:
-        return _FusedSSIM.apply(x, y)
+        return _FusedSSIM.apply(x, y)  # type: ignore[no-untyped-call]
     if x.device.type == "cuda" and x.dtype == torch.float32:
-        return _OnGpu.apply(x, y)
+        return _OnGpu.apply(x, y)  # type: ignore[no-untyped-call]
     return ssim_reference(x, y)
 
 
@@ -58,15 +60,15 @@ class _FusedSSIM(torch.autograd.Function):
     """Value and gradient in one native pass."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
         x, y = x.detach().contiguous(), y.detach().to(torch.float32).contiguous()
         gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
-        value = native.module().ssim(x, y, gradient, torch.get_num_threads())
+        value = native.kernels().ssim(x, y, gradient, torch.get_num_threads())
         ctx.gradient = gradient
         return x.new_tensor(value)
 
     @staticmethod
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         return upstream * ctx.gradient, None
 
 
@@ -74,13 +76,13 @@ class _OnGpu(torch.autograd.Function):
     """By the CUDA kernels; nothing waits for the GPU."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, y: Tensor) -> Tensor:
         x, y = x.detach().contiguous(), y.detach().to(x).contiguous()
         value, derivatives = gpu.forward(x, y, ctx.needs_input_grad[0])
         ctx.save_for_backward(x, y, *derivatives)
         return value
 
     @staticmethod
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         x, y, *derivatives = ctx.saved_tensors
         return gpu.backward(x, y, tuple(derivatives), upstream), None

@@ -31,7 +31,7 @@ def validate(splats: Splats, values: bool = True) -> None:
         raise BadInput("splats.antialias: gaussians of geometry 'ray' have no dilation to make up for; leave it off")
     count = len(splats)
     columns = 2 if splats.kind == "surfel" else 3
-    wanted = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": (), "sh": None}
+    wanted: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": ()}
     for name, tensor in splats.tensors().items():
         shape = tuple(tensor.shape)
         if name == "sh":

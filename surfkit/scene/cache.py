@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 T = TypeVar("T")
 
 
-class Cache(Sequence, Generic[T]):
+class Cache(Sequence[T], Generic[T]):
     """Values by position, read when they are asked for or shortly before.
 
     The budget is kept by dropping what is needed last: what has been used and is not foreseen again, then what is
@@ -44,6 +44,8 @@ class Cache(Sequence, Generic[T]):
         self._stop = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
         self._kept: dict[int, Future[T]] = {}  # the longest unused first
         self._bytes = 0
+        self._needed: dict[int, int] = {}
+        self._turn = 0
         self.lowered = False
         """Whether the budget has been changed."""
         self.expect(range(len(self._sizes)))
@@ -51,7 +53,7 @@ class Cache(Sequence, Generic[T]):
     def __len__(self) -> int:
         return len(self._sizes)
 
-    def __getitem__(self, at: int, /) -> T:  # type: ignore[override] (no slices)
+    def __getitem__(self, at: int, /) -> T:  # type: ignore[override]  # no slices
         """The value of a position; waits until it is read, and reads on.
 
         Raises:

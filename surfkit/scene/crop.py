@@ -85,7 +85,7 @@ def read_crop(path: Path) -> Crop:
     """
     try:
         data = read_json(path, dict[str, Any])
-        axis = str(data["orthogonal_axis"]).lower()
+        axis: Any = str(data["orthogonal_axis"]).lower()
         if axis not in PLANES:
             raise BadInput(f"{path}: orthogonal_axis is {data['orthogonal_axis']!r}; it must be X, Y or Z")
         corners = np.array(data["bounding_polygon"], np.float64)

@@ -97,7 +97,12 @@ def from_wkt(where: str, text: str) -> CRS:
 def in_plan(crs: CRS) -> CRS:
     """A system without its heights, and without the shift of datum (TOWGS84) that its text may have."""
     flat = crs.sub_crs_list[0] if crs.is_compound else crs
-    return flat.source_crs if flat.is_bound else flat
+    return _unbound(flat)
+
+
+def _unbound(crs: CRS) -> CRS:
+    """A system without the transformation that is bound to it."""
+    return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
 def code_in(crs: CRS) -> str | None:
@@ -204,13 +209,15 @@ def scale_at(crs: str, place: np.ndarray) -> float:
 
 def degrees_of(crs: str, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P,) longitudes and latitudes of (P, 2) eastings and northings, degrees on the datum of the system itself."""
-    flat = parsed(crs).to_2d()
-    flat = flat.source_crs if flat.is_bound else flat
-    own = flat.geodetic_crs.to_2d()
+    flat = _unbound(parsed(crs).to_2d())
+    geodetic = flat.geodetic_crs
+    assert geodetic is not None, "a system in plan has one"
+    own = geodetic.to_2d()
     found = Transformer.from_crs(flat, own, always_xy=True).transform(*np.asarray(places, np.float64)[:, :2].T)
     lon, lat = (np.degrees(np.asarray(at) * own.axis_info[0].unit_conversion_factor) for at in found)
     meridian = own.prime_meridian
-    return lon + np.degrees(meridian.longitude * meridian.unit_conversion_factor), lat
+    assert meridian is not None, "a geodetic system has one"
+    return lon + np.degrees(meridian.longitude * float(meridian.unit_conversion_factor)), lat
 
 
 def exact(source: Any, target: Any) -> Any | None:
@@ -242,7 +249,7 @@ def missing(source: Any, target: Any, lon: float, lat: float) -> tuple[list[str]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the best one is not available, as is said here
-            group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
+            group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)  # type: ignore[arg-type]
     except ProjError:
         return [], -1.0
     best = min(group.unavailable_operations, key=lambda each: each.accuracy if each.accuracy >= 0 else math.inf,

@@ -221,10 +221,12 @@ def _third_flattening() -> tuple[float, float]:
 def _plainly(crs: str, xyz: np.ndarray, geoid: Geoid | None) -> np.ndarray:
     """ECEF of coordinates of UTM on WGS 84, or of a topocentric frame."""
     if found := UTM_PATTERN.fullmatch(crs):
-        latitude, longitude = from_utm(xyz[:, 0], xyz[:, 1], int(found[2]), found[1] == "7")
-        above = 0.0 if geoid is None else geoid(latitude, longitude)
-        return geocentric(latitude, longitude, xyz[:, 2] + above)
-    latitude, longitude, height = map(float, TOPOCENTRIC.fullmatch(crs).groups())
+        latitudes, longitudes = from_utm(xyz[:, 0], xyz[:, 1], int(found[2]), found[1] == "7")
+        above = 0.0 if geoid is None else geoid(latitudes, longitudes)
+        return geocentric(latitudes, longitudes, xyz[:, 2] + above)
+    topocentric = TOPOCENTRIC.fullmatch(crs)
+    assert topocentric is not None, "callers have looked at the system"
+    latitude, longitude, height = map(float, topocentric.groups())
     if geoid is not None:
         height += geoid(np.array([latitude]), np.array([longitude]))[0]
     return geocentric(latitude, longitude, height) + xyz @ east_north_up(latitude, longitude).T

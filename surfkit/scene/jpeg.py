@@ -28,7 +28,8 @@ def with_end(path: Path) -> bytes | None:
     if data.endswith(EOI_MARKER):
         return None
     data = data[:-1] if data.endswith(EOI_MARKER[:1]) else data
-    if not np.array_equal(*(_pixels(data + more + EOI_MARKER) for more in (b"", MISSING_PIXEL_BYTES))):
+    plain, marked = (_pixels(data + more + EOI_MARKER) for more in (b"", MISSING_PIXEL_BYTES))
+    if not np.array_equal(plain, marked):
         return None
     return data + EOI_MARKER
 

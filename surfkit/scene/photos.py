@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -142,7 +142,8 @@ def require_heif(what: str) -> None:
 
 
 def _stored_size(image: Image.Image) -> tuple[int, int]:
-    return (image.tag_v2[WIDTH_TAG], image.tag_v2[HEIGHT_TAG]) if image.format == "TIFF" else image.size
+    tags: Any = getattr(image, "tag_v2", None)  # of TIFF files only
+    return image.size if tags is None or image.format != "TIFF" else (tags[WIDTH_TAG], tags[HEIGHT_TAG])
 
 
 def open_header(path: Path, use: Callable[[Image.Image], T]) -> T:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
@@ -175,7 +175,8 @@ def _eight_bits(values: np.ndarray, level: int) -> np.ndarray:
 
 def _stretched(image: Image.Image, path: Path, level: int) -> Image.Image:
     """16 bits of colour as 8, with `level` as 255; of an opacity, all 16 bits count."""
-    with open_image(path) as again:
+    with open_image(path) as opened:
+        again: Any = opened  # `tile` is that of image files only
         place, raw = again.tile[0], _raw_mode(again)
         args = (OTHER_HALF[raw], *place.args[1:]) if isinstance(place.args, tuple) else OTHER_HALF[raw]
         again.tile = [tile._replace(args=args) for tile in again.tile]

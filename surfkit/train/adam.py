@@ -64,7 +64,7 @@ def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rat
         return
     rate, correction = _corrected(rate, index)
     if native.module() is not None and all(_plain(t) for t in tensors):
-        native.module().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
+        native.kernels().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
         return
     exp_avg.lerp_(grad, 1 - BETA1)
     exp_avg_sq.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
@@ -102,12 +102,12 @@ def update_rows(
     if native.module() is not None and all(_plain(t) for t in tensors):
         rate, correction = _corrected(rate, index)
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
-        native.module().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
+        native.kernels().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
-    some = [tensor.index_select(0, rows) for tensor in (value, exp_avg, exp_avg_sq)]
-    some[2] *= kept.view(-1, *[1] * (value.dim() - 1))
-    update(some[0], grad, *some[1:], rate, index)
-    for tensor, part in zip((value, exp_avg, exp_avg_sq), some, strict=True):
+    some, first, second = (tensor.index_select(0, rows) for tensor in (value, exp_avg, exp_avg_sq))
+    second *= kept.view(-1, *[1] * (value.dim() - 1))
+    update(some, grad, first, second, rate, index)
+    for tensor, part in zip((value, exp_avg, exp_avg_sq), (some, first, second), strict=True):
         tensor[rows] = part
 
 

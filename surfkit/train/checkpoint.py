@@ -116,7 +116,7 @@ def load_last(path: Path) -> tuple[StageState, str | None] | None:
 def last_whole(path: Path, read: Callable[[Path], Read]) -> tuple[Read, str | None] | None:
     """What `read` makes of the last file that it does not refuse by BadInput; else as `load_last`."""
     there = [file for file in (path, before(path)) if file.exists()]
-    wrong = []
+    wrong: list[str] = []
     for file in there:
         try:
             return read(file), wrong[0] if wrong else None
@@ -275,7 +275,7 @@ def digest(facts: str, tensors: Iterable[tuple[str, Tensor, Iterable[Tensor]]]) 
         found.update(f"\0{name}\0{like.dtype}\0{tuple(like.shape)}\0".encode())
         for value in pieces:
             value = value.detach().cpu().contiguous()
-            found.update(value.reshape(-1).view(torch.uint8).numpy() if value.numel() else b"")
+            found.update(value.reshape(-1).view(torch.uint8).numpy().data if value.numel() else b"")
     return found.hexdigest()
 
 

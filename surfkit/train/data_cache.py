@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -78,7 +79,7 @@ class TrainingData:
         """Of the GPU, that views may take."""
         return cache_bytes(self.gpu, "--gpu-cache", lambda: int(GPU_SHARE * free_gpu_bytes()))
 
-    def caches(self) -> Iterator[Cache]:
+    def caches(self) -> Iterator[Cache[Any]]:
         """Those that there are."""
         return filter(None, (self.photos, self.masks, self.priors))
 
@@ -133,6 +134,7 @@ def read_ahead(
     wanted = [3 * pixels, sum(mask_sizes(scene.train)), prior_bytes(normals) * pixels if needed else 0]
     for_photos, for_masks, for_priors = share(budget, wanted)
     priors = read_priors(data, scene, for_priors, known, normals) if needed else None
-    copies = DecodedPhotoCache(data.path) if caches.copies and 3 * pixels > for_photos else None
+    is_short = for_photos is not None and 3 * pixels > for_photos
+    copies = DecodedPhotoCache(data.path) if caches.copies and is_short else None
     photos, masks = photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks)
     return TrainingData(photos, masks, priors, caches.gpu)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -59,7 +60,9 @@ class ImageAppearance:
     def backward(self, losses: list[Tensor]) -> None:
         """Find the gradient of the sum of losses, whose graph stays."""
         if losses:
-            self.grad = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)[0]
+            self.grad = torch.autograd.grad(
+                reduce(torch.add, losses), self.numbers, retain_graph=True, allow_unused=True
+            )[0]
 
     def learn(self) -> None:
         """Take this photograph's next step of Adam, if there is a gradient."""

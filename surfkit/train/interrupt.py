@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 from surfkit.core.signals import asking
 
@@ -26,7 +27,7 @@ def graceful() -> Iterator[StopRequest]:
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield request
         return
-    previous = {number: signal.getsignal(number) for number in asking()}
+    previous: dict[int, Any] = {number: signal.getsignal(number) for number in asking()}
 
     def ask(number: int, frame: object) -> None:
         request.asked = True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import torch
@@ -21,9 +22,11 @@ def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Map
 
     `shared`: other losses have part of their graph in common with these, and come later.
     """
-    grads = [None] * len(leaves)
+    grads: Sequence[Tensor | None] = [None] * len(leaves)
     if losses:
-        grads = torch.autograd.grad(sum(losses), list(leaves.values()), allow_unused=True, retain_graph=shared)
+        grads = torch.autograd.grad(
+            reduce(torch.add, losses), list(leaves.values()), allow_unused=True, retain_graph=shared
+        )
     found = Maps(**dict(zip(leaves, grads, strict=True)))
     return found if found.color is not None else replace(found, color=torch.zeros_like(leaves["color"]))
 
@@ -51,7 +54,7 @@ def loss_gradients(
     terms = signal.terms
     leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
     leafy = Maps(**leaves)
-    compared = leafy if appearance is None else replace(leafy, color=appearance.shown(leafy.color))
+    compared = leafy if appearance is None else replace(leafy, color=appearance.shown(leafy.need("color")))
     compared, target = ignoring(compared, target)
     values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
     numbers = as_numbers(values)
@@ -89,7 +92,7 @@ def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Ten
     """
     splats, grads = shape.named(), gradients.named()
     names = [name for name, value in splats.items() if value.requires_grad and name in grads]
-    known = _KnownGradient.apply([grads[name] for name in names], *(splats[name] for name in names))
+    known = _KnownGradient.apply([grads[name] for name in names], *(splats[name] for name in names))  # type: ignore[no-untyped-call]
     raw = torch.autograd.grad([known, *terms], list(leaves.values()), allow_unused=True)
     return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}
 

@@ -52,7 +52,7 @@ def neighbour(setup: StageSetup, state: StageState, splats: Splats, shown: int, 
         shown: Position of the view.
         maps: What is rendered there.
     """
-    found = (setup.beside or setup.selector.neighbours)(shown, maps.median)
+    found = (setup.beside or setup.selector.neighbours)(shown, maps.need("median"))
     generator = torch.Generator().manual_seed(state.seed)
     first = int(torch.randint(max(1, len(found)), (), generator=generator))
     for at in (*found[first:], *found[:first]):

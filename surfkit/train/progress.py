@@ -84,7 +84,7 @@ class TrainingDisplay:
         self.loss.add(sum(done.losses.values()))
         last = done.index == self.steps
         if done.index % PSNR_EVERY == 0 or last:
-            self.psnr.add(psnr(done.maps.color, done.target.photo))
+            self.psnr.add(psnr(done.maps.need("color"), done.target.photo))
         now = time.perf_counter()
         self.pace.add(now - self.last)
         self.last = now
@@ -94,7 +94,7 @@ class TrainingDisplay:
         line = self.line(done)
         if self.outer is not None:
             self.outer(self.stage, done.index, self.steps, line)
-        elif self.bar is None:
+        elif self.bar is None or self.task is None:
             self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True, markup=False)
         else:
             self.bar.update(self.task, completed=done.index, line=line)

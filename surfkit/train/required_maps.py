@@ -31,9 +31,10 @@ def maps_read(
         indices: Steps, 1 to `steps`.
         steps: Of the stage.
     """
-    found = {}
+    groups: dict[str, Mapping[str, Loss | Regularizer]] = {"losses": losses, "regularizers": regularizers}
+    found: dict[str, str] = {}
     for index in indices:
-        for group, terms in {"losses": losses, "regularizers": regularizers}.items():
+        for group, terms in groups.items():
             for name, term in terms.items():
                 if term.weight_at(index, steps) > 0:
                     # the neighbour of a pair is chosen by the median depth

@@ -37,7 +37,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     params = state.points.all_params() if in_view is None else in_view.of_columns(state.points.params)
     leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
     shape = setup.primitive.activate(leaves, state.sh_degree)
-    splats = with_frozen(setup, state, shape, state.sh_degree, in_view and camera)
+    splats = with_frozen(setup, state, shape, state.sh_degree, None if in_view is None else camera)
     render = setup.draws.render(splats, camera, stage.near, bool(reads.keys() & GEOMETRY_MAPS), "distortion" in reads)
     refuse_wrong_maps(setup.primitive, render.maps, camera, reads)
     setup.uploads.ahead(state.order, state.skipped)  # the next view is read while the GPU works on this one
@@ -71,7 +71,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
         result.appearance.learn()
-    adam_step(state.points, grads, step.rates, index, in_view and in_view.rows)
+    adam_step(state.points, grads, step.rates, index, None if in_view is None else in_view.rows)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
     state.points = fitted(setup.primitive, state.points)

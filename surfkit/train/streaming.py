@@ -137,7 +137,7 @@ def _begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) 
 
 
 def _bytes(value: Tensor) -> memoryview:
-    return memoryview(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data
 
 
 def _without_values(file: Any, name: str) -> Tensor:

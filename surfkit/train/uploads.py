@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -124,14 +124,17 @@ class Uploads:
             return error
         mask = None if masks is None else out_of_turn(masks, at) if aside else masks[at]
         prior = None if priors is None or aside else priors[at]
-        there = (None if each is None else uploaded(each, self._device) for each in (photo, mask, prior))
-        return UploadedView(*there)
+        return UploadedView(
+            uploaded(photo, self._device),
+            None if mask is None else uploaded(mask, self._device),
+            None if prior is None else uploaded(prior, self._device),
+        )
 
 
 def uploaded(known: Known, device: torch.device) -> Known:
     """A photograph, mask or depth prior on a device; to a GPU it travels while the host goes on."""
     if isinstance(known, DepthPrior):
-        there = {name: uploaded(v, device) for name, v in vars(known).items() if isinstance(v, Tensor)}
+        there: dict[str, Any] = {name: uploaded(v, device) for name, v in vars(known).items() if isinstance(v, Tensor)}
         return replace(known, **there)
     if device == known.device:
         return known

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.culling import may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
@@ -167,7 +168,7 @@ class CudaRender(Render):
         self.seen, self.radii = drawn.seen.to(drawn.home), drawn.radii.to(drawn.home)
 
     @cached_property
-    def maps(self) -> Maps:
+    def maps(self) -> Maps:  # type: ignore[override]  # drawn when it is asked for
         """See `Render`."""
         return Maps(**{name: value.to(self._pass.home) for name, value in self._drawn.items()})
 
@@ -216,7 +217,8 @@ class CudaRender(Render):
         given = *arrays, drawn.view, drawn.index, drawn.first, sums, touched, rows
         gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
         home = drawn.home
-        return Gradients(*(g.to(home) for g in grads), signal.to(home), None if chosen is None else part.to(home))
+        standard: dict[str, Any] = {name: grad.to(home) for name, grad in zip(STANDARD, grads, strict=True)}
+        return Gradients(**standard, signal=signal.to(home), chosen=None if chosen is None else part.to(home))
 
     def _levels(self, total: Maps, chosen: Maps | None, absolute: bool) -> tuple[int, int]:
         """Only what has a cotangent costs time."""
@@ -296,7 +298,7 @@ def _upload(tensor: Tensor, device: torch.device) -> Tensor:
     are drawn of the same splats."""
     if tensor.device == device:
         return tensor.detach().to(torch.float32).contiguous()
-    known = UPLOADED.get(tensor)
+    known: Any = UPLOADED.get(tensor)  # type: ignore[no-untyped-call]
     if known is None or known[:2] != (device, tensor._version):
         there = tensor.detach().to(device, torch.float32).contiguous()
         UPLOADED[tensor] = known = device, tensor._version, there

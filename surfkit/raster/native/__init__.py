@@ -6,6 +6,7 @@ import importlib
 import os
 from functools import cache
 from types import ModuleType
+from typing import Any
 
 from surfkit.core.check import BadInput
 
@@ -17,7 +18,7 @@ def module() -> ModuleType | None:
     SURFKIT_KERNELS=avx512|avx2|baseline picks one compilation of the kernels; by default the best that runs is used.
     """
     try:
-        from surfkit.raster.native import _native
+        _native = importlib.import_module("surfkit.raster.native._native")
     except ImportError:
         return None
     if wanted := os.environ.get("SURFKIT_KERNELS"):
@@ -25,6 +26,18 @@ def module() -> ModuleType | None:
             raise BadInput(f"SURFKIT_KERNELS={wanted}: this machine can run {', '.join(_native.kernels())}")
         _native.use_kernels(wanted)
     return _native
+
+
+def kernels() -> Any:
+    """The compiled extension, for those who have asked `module` whether there is one.
+
+    Raises:
+        RuntimeError: There is none.
+    """
+    found = module()
+    if found is None:
+        raise RuntimeError(lacking())
+    return found
 
 
 def lacking() -> str:

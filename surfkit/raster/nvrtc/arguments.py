@@ -107,7 +107,8 @@ def signatures(source: CudaSource, device: torch.device) -> dict[str, Signature]
 
 
 def _three(size: Size) -> tuple[int, int, int]:
-    return (*((size,) if isinstance(size, int) else size), 1, 1)[:3]
+    x, y, z, *_ = *((size,) if isinstance(size, int) else size), 1, 1
+    return x, y, z
 
 
 def _packer(source: CudaSource, kernel: Kernel, parameter: Parameter, device: torch.device) -> Callable[[Any], Any]:
@@ -163,7 +164,8 @@ def _structure_packer(where: str, structure: type[ctypes.Structure]) -> Callable
 
 def _number_packer(where: str, name: str) -> Callable[[Any], Any]:
     number = SCALAR_TYPES[name]
-    wanted = {ctypes.c_bool: bool, ctypes.c_float: (int, float), ctypes.c_double: (int, float)}.get(number, int)
+    kinds: dict[Any, Any] = {ctypes.c_bool: bool, ctypes.c_float: (int, float), ctypes.c_double: (int, float)}
+    wanted = kinds.get(number, int)
 
     def pack(value: Any) -> Any:
         if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):

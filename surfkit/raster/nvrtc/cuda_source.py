@@ -88,7 +88,7 @@ def _resolved(path: Path, seen: set[Path]) -> str:
     seen.add(path)
     text = re.sub(r"(?m)^#pragma once$", "", path.read_text(encoding="utf-8"))
 
-    def include(match: re.Match) -> str:
+    def include(match: re.Match[str]) -> str:
         target = path.parent / match[1]
         if CUDA_FOLDER / "emulator" in target.resolve().parents:
             return match[0]  # for C++ compilers only, which find it themselves
@@ -98,7 +98,7 @@ def _resolved(path: Path, seen: set[Path]) -> str:
     return f'#line 1 "{path.name}"\n{INCLUDE.sub(include, text)}\n'
 
 
-def _kernel(match: re.Match, text: str) -> Kernel:
+def _kernel(match: re.Match[str], text: str) -> Kernel:
     bound, name, declared = match.groups()
     parameters = tuple(_parameter(part, name) for part in declared.split(",") if part.strip())
     bound = bound.split(",")[0].strip()
