@@ -19,6 +19,7 @@ test: $(VENV)/.installed
 
 lint: $(VENV)/.installed
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
+	$(PY) .ci/types
 
 # The site of docs/, in site/; a link or an anchor that leads nowhere is an error.
 docs: $(VENV)/.installed
@@ -37,7 +38,7 @@ fuzz: $(VENV)/.installed
 	$(PY) bench/fuzz.py --cases 10000
 
 # Reinstalled when what is compiled or declared changes; the Python files are used in place.
-$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/*/*.h surfkit/raster/native/*.cpp surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)
+$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/*/*.h surfkit/raster/native/* surfkit/*/cpu/* surfkit/*/*/cpu/*)
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
 	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev,docs]"

@@ -103,7 +103,8 @@ class TrainedRun:
 
     @property
     def splats(self) -> SplatTable:
-        """The splats, frame of the input: `means` (N, 3), `opacities` (N,), `scales`, `quats` (N, 4), and so on.
+        """The splats, frame of the input: `means` (N, 3), `opacities` (N,), `scales` (N, 2 or 3), `quats` (N, 4) w x y
+        z, `sh0` (N, 3), `sh_rest` (N, K - 1, 3); float32.
 
         Raises:
             BadInput: Its method makes none.

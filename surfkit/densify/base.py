@@ -130,7 +130,7 @@ class Densify(Policy):
         It is used where memory has run out and where an ablation limits all rows alike, so the limit must hold. This
         default wraps the densifier; one with a limit of its own, which knows whom to prefer, lowers that.
         """
-        limited: Any = find(Densify, "limited")  # type: ignore[type-abstract]
+        limited: Any = find(Densify, "limited")
         return limited(self, points)
 
 

@@ -169,9 +169,12 @@ def estimate(
     found = {one.at: one for one in estimator.estimate(given, range(len(SIDES)))}
     size = (pair.left.height, pair.left.width)
     nothing = Estimated(torch.zeros(size), None)
-    if any(found[at].inverse is None for at in range(len(SIDES))):
-        return nothing
-    trusted = [torch.where(found[at].confidence > 0, found[at].inverse, 0.0).cpu() for at in range(len(SIDES))]
+    trusted = []
+    for at in range(len(SIDES)):
+        inverse, confidence = found[at].inverse, found[at].confidence
+        if inverse is None or confidence is None:
+            return nothing
+        trusted.append(torch.where(confidence > 0, inverse, 0.0).cpu())
     left, right = (pair.disparity(inverse) for inverse in trusted)
     depth = pair.depth(torch.where(consistent(left, right, tolerance_px), left, 0.0))
     normal = found[0].normal

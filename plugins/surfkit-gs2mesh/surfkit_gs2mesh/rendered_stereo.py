@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -110,11 +110,11 @@ class RenderedStereo(Mesher):
         pair = Pair(view.camera, self.baseline, self.nearest, self.farthest)
         maps, partner = (subject.draw(replace(view, camera=camera)) for camera in pair.cameras)
         with tempfile.TemporaryDirectory(dir=folder) as work:
-            pictures = (maps.color, partner.color)
+            pictures = (maps.need("color"), partner.need("color"))
             found = estimate(pair, pictures, self.estimator, self.tolerance_px, Path(work))
-        depth = torch.where(maps.alpha >= OPAQUE, found.depth, 0.0)
-        normal = {} if found.normal is None else {"normal": found.normal.numpy()}
-        color = (maps.color.clamp(0, 1) * 255).round().to(torch.uint8)
+        depth = torch.where(maps.need("alpha") >= OPAQUE, found.depth, 0.0)
+        normal: dict[str, Any] = {} if found.normal is None else {"normal": found.normal.numpy()}
+        color = (maps.need("color").clamp(0, 1) * 255).round().to(torch.uint8)
         np.savez(folder / f"{at}.npz", depth=depth.numpy(), color=color.numpy(), **normal)
         emit(Progress("stereo on rendered pairs", at + 1, len(subject.views)))
         return float((depth > 0).double().mean())

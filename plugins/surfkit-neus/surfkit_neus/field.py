@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -73,9 +73,10 @@ class SurfaceField(nn.Module):
         wide = networks.width
         hidden = [wide] * networks.distance_layers
         self.distance = _network([3 + self.encoding.width, *hidden, 1 + networks.features], draw, SHARPNESS)
+        last: Any = self.distance[-1]
         with torch.no_grad():
-            self.distance[-1].weight[0] = 0
-            self.distance[-1].bias[0] = 0
+            last.weight[0] = 0
+            last.bias[0] = 0
         seen = 3 + 3 + directions(torch.zeros(1, 3)).shape[1] + networks.features
         self.shade = _network([seen, *[wide] * networks.color_layers, 3], draw)
         self.log_sharpness = nn.Parameter(torch.tensor(math.log(sharpness) / SCALE))

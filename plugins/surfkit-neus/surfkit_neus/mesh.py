@@ -73,7 +73,7 @@ def _colors(field: SurfaceField, x: Tensor, look: Look) -> Tensor:
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Keep a mesh, also one without a face."""
-    colors = {} if mesh.colors is None else {"colors": mesh.colors}
+    colors: dict[str, Any] = {} if mesh.colors is None else {"colors": mesh.colors}
     with replacing(path) as file:
         np.savez(file, vertices=mesh.vertices, faces=mesh.faces, **colors)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import TYPE_CHECKING
+
+import torch
 
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.plugin import Fault, MethodInput, StageBegan, StepDone, emit, graceful
@@ -59,6 +62,6 @@ def make_step(method: NeuralSurface, state: State, batches: Batches) -> dict[str
             f"step {index}: the losses are NaN or Inf ({told}); the last checkpoint is kept. Lower method.rate and "
             "method.grid-rate, and train in a new folder"
         )
-    sum(losses.values()).backward()
+    reduce(torch.add, losses.values()).backward()
     state.descend(method.rates(index, list(state.moments)), method.decay)
     return told

@@ -34,7 +34,7 @@ def network_columns(feature: int, hidden: int, offsets: int) -> dict[str, Column
         hidden: Width of the hidden layers.
         offsets: Gaussians of an anchor.
     """
-    found = {}
+    found: dict[str, Column] = {}
     for name, each in PER_OFFSET.items():
         shapes = {
             "in": (feature + SIGHT, hidden),
@@ -51,7 +51,7 @@ def fresh_networks(columns: Mapping[str, Column], generator: torch.Generator) ->
     found = {}
     for name in PER_OFFSET:
         for layer in ("in", "out"):
-            inputs, outputs = columns[f"{name}_{layer}"].shape
+            inputs, outputs = columns[f"{name}_{layer}"].of_point
             for part, shape in ((layer, (inputs, outputs)), (f"{layer}_bias", (outputs,))):
                 drawn = torch.rand(shape, generator=generator)
                 found[f"{name}_{part}"] = (2 * drawn - 1) / math.sqrt(inputs)

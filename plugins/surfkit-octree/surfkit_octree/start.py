@@ -77,8 +77,8 @@ class AnchorVoxels(Start):
             places.append(place[drawn])
             colours.append(rgb[first[drawn]])
             levels.append(of[drawn])
-        level = torch.cat(levels)
-        return SparsePoints(torch.cat(places), torch.cat(colours), size=table.side(level)), level, table
+        of_point = torch.cat(levels)
+        return SparsePoints(torch.cat(places), torch.cat(colours), size=table.side(of_point)), of_point, table
 
     def cloud(self, known: StartInput) -> SparsePoints:
         """See `Start.cloud`."""

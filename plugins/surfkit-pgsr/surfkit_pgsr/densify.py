@@ -73,6 +73,7 @@ class TwoThresholdADC(Densify):
         filters = (*self.adc.filters, CountCap(self.points))
         hot = admitted(filters, step, torch.maximum(signed, absolute))
         edit, large = self.adc.edit_of(points, step, hot), hot & (signed == 0)
+        assert edit.clone is not None and edit.split is not None, "ADC gives both"
         return replace(edit, clone=edit.clone & ~large, split=edit.split | large)
 
     def wants(self, points: Points) -> tuple[Tensor, Tensor]:

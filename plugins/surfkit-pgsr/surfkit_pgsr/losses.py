@@ -43,12 +43,12 @@ class EdgeAwareNormal(Loss):
         return self.weight if index > self.start else 0.0
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        depth = maps.expected_depth()
+        depth, normal = maps.expected_depth(), maps.need("normal")
         surface, valid = normals_of(depth, target.view.camera)
         if valid.numel() == 0:
-            return 0 * (depth.sum() + maps.normal.sum())
-        alpha = maps.alpha.detach()[1:-1, 1:-1]
-        apart = (maps.normal[:, 1:-1, 1:-1] - alpha * surface).abs().sum(0)
+            return 0 * (depth.sum() + normal.sum())
+        alpha = maps.need("alpha").detach()[1:-1, 1:-1]
+        apart = (normal[:, 1:-1, 1:-1] - alpha * surface).abs().sum(0)
         weight = (1 - edges(target.photo)) ** self.power
         return torch.where(valid, weight * apart, 0.0).sum() / valid.numel()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -134,7 +135,7 @@ class PlaneRender(Render):
         )
         self.seen, self.radii = self._all.seen, self._all.radii
         drawn = self._all.maps
-        depth, median = self._depths(drawn.alpha, drawn.normal, self._far.maps.color[0])
+        depth, median = self._depths(drawn.need("alpha"), drawn.need("normal"), self._far.maps.need("color")[0])
         self.maps = replace(drawn, depth=depth, median=median)
 
     def _depths(self, alpha: Tensor, normal: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,7 +152,7 @@ class PlaneRender(Render):
         found = self._all.backward(direct, part, absolute, rows)
         if far is None and far_part is None:
             return found
-        blank = Maps(color=torch.zeros_like(self.maps.color))
+        blank = Maps(color=torch.zeros_like(self.maps.need("color")))
         other = self._far.backward(far or blank, None if chosen is None else far_part or blank, absolute, rows)
         return _added(found, other)
 
@@ -161,7 +162,8 @@ class PlaneRender(Render):
         wanted = [given.pop(name, None) for name in ("depth", "median")]
         if all(value is None for value in wanted):
             return cotangents, None
-        leaves = [t.detach().requires_grad_() for t in (self.maps.alpha, self.maps.normal, self._far.maps.color[0])]
+        drawn = self.maps.need("alpha"), self.maps.need("normal"), self._far.maps.need("color")[0]
+        leaves = [t.detach().requires_grad_() for t in drawn]
         with torch.enable_grad():
             made = self._depths(*leaves)
         pairs = [(map, value) for map, value in zip(made, wanted, strict=True) if value is not None]
@@ -171,13 +173,13 @@ class PlaneRender(Render):
         for name, value in (("alpha", alpha), ("normal", normal)):
             if value is not None:
                 given[name] = given[name] + value if name in given else value
-        color = torch.zeros_like(self.maps.color)
+        color = torch.zeros_like(self.maps.need("color"))
         color[0] = distance
         return Maps(**given), Maps(color=color)
 
 
 def _added(one: Gradients, other: Gradients) -> Gradients:
     """The sum of two gradients by the same splats."""
-    summed = {name: value + other.tensors()[name] for name, value in one.tensors().items()}
-    chosen = None if one.chosen is None else one.chosen + other.chosen
+    summed: dict[str, Any] = {name: value + other.tensors()[name] for name, value in one.tensors().items()}
+    chosen = None if one.chosen is None or other.chosen is None else one.chosen + other.chosen
     return replace(one, **summed, signal=one.signal + other.signal, chosen=chosen)

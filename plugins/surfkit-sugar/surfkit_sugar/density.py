@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -78,6 +79,11 @@ def turned(near: Sequence[Tensor], vectors: Sequence[Tensor]) -> list[Tensor]:
     return [near[3 + 3 * k] * x + near[4 + 3 * k] * y + near[5 + 3 * k] * z for k in range(3)]
 
 
+def added(terms: Iterable[Tensor]) -> Tensor:
+    """Their sum, in their order; one term at least."""
+    return reduce(torch.add, terms)
+
+
 def density(near: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """(M,) density of Gaussians near places, and (M, 3) the direction in which it falls: -gradient / density.
 
@@ -87,9 +93,9 @@ def density(near: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
     """
     rows = near.unbind(0)  # once: the way back of each index would fill a whole table
     offsets = whitened(rows, places)
-    shares = rows[12] * torch.exp(-0.5 * sum(offset.square() for offset in offsets))
+    shares = rows[12] * torch.exp(-0.5 * added(offset.square() for offset in offsets))
     total = shares.sum(1)
     shares = shares / total.detach().clamp_min(1e-30)[:, None]
     pulls = [shares * offset for offset in offsets]
-    falls = [sum((pulls[k] * rows[3 + 3 * k + axis]).sum(1) for k in range(3)) for axis in range(3)]
+    falls = [added((pulls[k] * rows[3 + 3 * k + axis]).sum(1) for k in range(3)) for axis in range(3)]
     return total, torch.stack(falls, 1)

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from surfkit.mesh.poisson import MIN_ORIENTED_POINTS, reconstructed, require_open3d, seen_pixels
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.plugin import BadInput, Mesh, Mesher, MeshInput
-from surfkit_sugar.density import Ellipsoids, density, gathered, turned, whitened
+from surfkit_sugar.density import Ellipsoids, added, density, gathered, turned, whitened
 from surfkit_sugar.neighbours import nearest
 
 CHUNK = 20_000
@@ -83,7 +83,8 @@ class LevelSetPoisson(Mesher):
             for rows in torch.arange(len(pixels.points)).split(CHUNK):
                 points, normals, met = field.crossings(pixels.points[rows], pixels.rays[rows])
                 found.append((points, normals, pixels.colors[rows][met]))
-        points, normals, colors = (torch.cat(part) for part in zip(*found, strict=True)) if found else [()] * 3
+        none = (torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+        points, normals, colors = (torch.cat(part) for part in zip(*(found or [none]), strict=True))
         if len(points) < MIN_ORIENTED_POINTS:
             raise BadInput(
                 f"mesh: the density crosses {self.level:g} before {len(points)} of {looked:,} pixels that have a depth "
@@ -135,7 +136,7 @@ class Search:
         """(M, S) densities at (M, S) distances along rays from places: exponents are quadratic in the distance."""
         rows = near.unbind(0)
         offset, slope = whitened(rows, places), turned(rows, [ray[:, None] for ray in rays.unbind(1)])
-        constant, linear, square = (sum(a * b for a, b in zip(*pair, strict=True)) for pair in (
+        constant, linear, square = (added(a * b for a, b in zip(*pair, strict=True)) for pair in (
             (offset, offset), (offset, slope), (slope, slope)
         ))  # fmt: skip
         total = torch.zeros_like(steps)

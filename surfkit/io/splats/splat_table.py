@@ -69,6 +69,16 @@ class SplatTable:
         return len(self.means)
 
     @property
+    def opacities(self) -> Tensor:
+        """(N,) in (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def scales(self) -> Tensor:
+        """(N, 2) or (N, 3) standard deviations along the axes."""
+        return self.log_scales.exp()
+
+    @property
     def sh_degree(self) -> int:
         """Highest degree of the spherical harmonics."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1

@@ -60,7 +60,7 @@ def kernels(source: CudaSource, device: torch.device) -> Kernels:
         BadInput: The machine lacks a compiler, or a driver that fits; says what to do.
     """
     if device.type == "cuda" and device.index is None:
-        device = torch.device("cuda", torch.cuda.current_device())  # type: ignore[unreachable]  # torch.device.index may be None
+        device = torch.device("cuda", torch.cuda.current_device())
     return _loaded(source, device)
 
 

@@ -30,7 +30,7 @@ class NewPart(Loss):
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         """The mean over pixels and channels."""
-        return ((maps.color - target.photo) ** 2 + self.epsilon**2).sqrt().mean()
+        return ((maps.need("color") - target.photo) ** 2 + self.epsilon**2).sqrt().mean()
 
 
 CHANGE: Mapping[str, Any] = {"pretrain.losses.l1": NewPart()}

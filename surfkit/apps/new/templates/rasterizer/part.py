@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -60,7 +62,7 @@ class NewPartRender(Render):
         """See `Render.backward`."""
         found = self._drawn.backward(total, chosen, absolute, rows)
         part = None if found.chosen is None else found.chosen.to(self._dtype)
-        tensors = converted({**found.tensors(), "signal": found.signal}, self._dtype)
+        tensors: dict[str, Any] = converted({**found.tensors(), "signal": found.signal}, self._dtype)
         return replace(found, **tensors, chosen=part)
 
 

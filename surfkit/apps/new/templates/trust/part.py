@@ -24,7 +24,7 @@ class NewPart(Trust):
 
     def within(self, maps: Maps, depth: Tensor, prior: DepthPrior | None) -> Tensor:
         """See `Trust.within`."""
-        alpha = maps.alpha.reshape(depth.shape)
+        alpha = maps.need("alpha").reshape(depth.shape)
         return torch.where(alpha >= self.least, alpha, 0.0)
 
     def among(self, at: int, depths: Depths) -> Tensor:
