@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from surfkit.plugin import BadInput
+from surfkit.plugin import BadInput, Maps
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart
@@ -13,7 +13,7 @@ def test_it_keeps_the_contract_of_its_kind():
 
 
 def test_its_value():
-    maps, target = SimpleNamespace(color=torch.full((3, 2, 2), 0.75)), SimpleNamespace(photo=torch.zeros(3, 2, 2))
+    maps, target = Maps(color=torch.full((3, 2, 2), 0.75)), SimpleNamespace(photo=torch.zeros(3, 2, 2))
     assert float(NewPart(epsilon=1.0)(maps, target)) == pytest.approx(1.25)
 
 

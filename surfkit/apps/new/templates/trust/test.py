@@ -1,8 +1,6 @@
-from types import SimpleNamespace
-
 import pytest
 import torch
-from surfkit.plugin import BadInput
+from surfkit.plugin import BadInput, Maps
 from surfkit.testing import check
 
 from new_plugin.new_part import NewPart
@@ -13,7 +11,7 @@ def test_it_keeps_the_contract_of_its_kind():
 
 
 def test_faint_pixels_are_left_out():
-    maps = SimpleNamespace(alpha=torch.tensor([[0.25, 0.75]]))
+    maps = Maps(alpha=torch.tensor([[0.25, 0.75]]))
     assert NewPart(least=0.5).within(maps, torch.ones(1, 2), None).tolist() == [[0.0, 0.75]]
 
 
