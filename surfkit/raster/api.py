@@ -107,19 +107,19 @@ class Splats:
         return self._with(lambda value, _: value[:count], self)
 
     def take(self, rows: Tensor) -> Splats:
-        """Those of a mask or of indices."""
+        """Those of a mask (N,) bool, or of indices (K,) int64."""
         return self._with(lambda value, _: value[rows], self)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five standard tensors by name, in the order of the fields."""
+        """The five standard tensors by name, (N, ...) each, in the order of the fields."""
         return {name: getattr(self, name) for name in STANDARD}
 
     def named(self) -> dict[str, Tensor]:
-        """All tensors by name: the standard ones, then those of `extra` and `shared`."""
+        """All tensors by name: the standard ones and those of `extra`, (N, ...), then those of `shared`."""
         return self.tensors() | dict(self.extra) | dict(self.shared)
 
     def with_named(self, tensors: Mapping[str, Tensor]) -> Splats:
-        """The same kind of splats with other tensors, as `named` gives them."""
+        """The same kind of M splats with other tensors, (M, ...) each, by the names of `named`."""
         standard: dict[str, Any] = {name: tensors[name] for name in STANDARD}
         extra, shared = ({name: tensors[name] for name in group} for group in (self.extra, self.shared))
         return replace(self, **standard, extra=extra, shared=shared)
@@ -156,11 +156,11 @@ class Maps:
     distortion: Tensor | None = None
 
     def present(self) -> dict[str, Tensor]:
-        """The maps that are there, by name."""
+        """The maps that are there by name, (C, H, W) or (H, W)."""
         return {f.name: v for f in fields(self) if (v := getattr(self, f.name)) is not None}
 
     def need(self, name: str) -> Tensor:
-        """The map of this name; ValueError if it was not asked for."""
+        """The map of this name, (3, H, W) or (H, W); ValueError if it was not asked for."""
         found: Tensor | None = getattr(self, name)
         if found is None:
             raise ValueError(f"the map {name!r} was not drawn; ask for it")
@@ -193,7 +193,8 @@ class Derived:
     grad_norm: Tensor | None = None
 
     def combined(self, combine: Callable[[Tensor, Tensor], Tensor]) -> Derived:
-        """The same with `grad_norm` set by a function of the chosen and the total signal, as `Signal.combine`."""
+        """The same with `grad_norm` set by a function of the chosen and the total signal, (M, 2) each, as
+        `Signal.combine`."""
         chosen = self.signal if self.chosen is None else self.chosen
         return replace(self, grad_norm=combine(chosen, self.signal).norm(dim=-1))
 
@@ -233,11 +234,11 @@ class Gradients:
     derived: Derived | None = None
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five standard gradients by name, in the order of `Splats.tensors`."""
+        """The five standard gradients by name, (N, ...) each, in the order of `Splats.tensors`."""
         return {name: getattr(self, name) for name in STANDARD}
 
     def named(self) -> dict[str, Tensor]:
-        """All gradients by name."""
+        """All gradients by name, of the shapes of the tensors."""
         return self.tensors() | dict(self.extra)
 
 

@@ -161,7 +161,8 @@ def summed_by_owner(values: Tensor, owner: Tensor, count: int) -> Tensor:
 def gathered(
     grads: dict[str, Tensor], signal: Tensor, chosen: Tensor | None, rows: int | None, shared: set[str]
 ) -> Gradients:
-    """Gradients by name as `Gradients`, of the first `rows` splats; of what is shared, all."""
+    """Gradients by name, (N, ...), with (N, 2) signals as `Gradients`, of the first `rows` splats; of what is shared,
+    all."""
     first = {name: value if name in shared else value[:rows] for name, value in grads.items()}
     extra = {name: value for name, value in first.items() if name not in STANDARD}
     standard: dict[str, Any] = {name: first[name] for name in STANDARD}

@@ -52,7 +52,7 @@ def disagreement(depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -
 
 
 def disagreement_reference(depth: Tensor, alpha: Tensor, normal: Tensor, camera: Camera) -> Tensor:
-    """The same in plain torch, in any precision."""
+    """`disagreement` of maps (H, W) and normals (3, H, W) in plain torch, in any precision."""
     surface, valid = normals_of(depth, camera)
     if valid.numel() == 0:
         return (depth * 0).sum()

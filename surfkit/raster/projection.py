@@ -95,7 +95,7 @@ def facing(normals: Tensor, centres: Tensor) -> Tensor:
 
 
 def clamped(z: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Depths kept in [low, high], which count as constants; low where not finite."""
+    """(N, ...) depths kept in [low, high], which count as constants; low where not finite."""
     inside = (z >= low) & (z <= high)
     return torch.where(inside, torch.where(inside, z, low), torch.where(z > high, high, low).detach())
 

@@ -58,7 +58,7 @@ def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> 
 
 
 def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-    """The same in plain torch, in the precision of the splats, every pair of a point and a splat."""
+    """(P,) as `ray_opacity`, in plain torch, in the precision of the splats, every pair of a point and a splat."""
     to_camera = camera.world_to_camera.to(splats.means)
     centre = splats.means @ to_camera[:3, :3].T + to_camera[:3, 3]
     axes = to_camera[:3, :3] @ rotations(splats.quats)

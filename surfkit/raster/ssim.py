@@ -30,7 +30,7 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
 
 
 def ssim_reference(x: Tensor, y: Tensor) -> Tensor:
-    """The same in plain torch, in any precision."""
+    """`ssim` of two images (C, H, W) in plain torch, in any precision."""
     return ssim_map(x, y).mean()
 
 

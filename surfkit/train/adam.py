@@ -57,7 +57,7 @@ def adam_step(
 
 
 def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int) -> None:
-    """Take one step of Adam on a tensor and its moments, in place."""
+    """Take one step of Adam on a tensor (N, ...) and its moments of the same shape, in place."""
     tensors = (value, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
         launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index)
@@ -114,7 +114,7 @@ def update_rows(
 def launch_update(
     on: Kernels, value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int
 ) -> None:
-    """What `update` does, by the kernel of adam.cu."""
+    """What `update` does to tensors of one shape (N, ...), by the kernel of adam.cu."""
     on.launch("adam", _blocks(grad), 256, value, grad, exp_avg, exp_avg_sq, *_numbers(rate, index))
 
 
@@ -129,7 +129,7 @@ def launch_update_rows(
     rate: float,
     index: int,
 ) -> None:
-    """What `update_rows` does, by the kernel of adam.cu."""
+    """What `update_rows` does to (R,) rows of tensors (N, ...), by the kernel of adam.cu."""
     wide = grad[:1].numel()
     tensors = value, rows, kept, grad, exp_avg, exp_avg_sq
     on.launch("adam_rows", _blocks(grad), 256, *tensors, wide, *_numbers(rate, index))

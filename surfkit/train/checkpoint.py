@@ -73,7 +73,8 @@ def save(path: Path, state: StageState) -> None:
 
 
 def beside_points(state: StageState) -> tuple[dict[str, Tensor], str]:
-    """What a file holds of a state beside its points: tensors, and facts as text."""
+    """What a file holds of a state beside its points: numbers of the photographs (V, ...), shared parameters, the order
+    of the views (V,), the generator's state (bytes,), and facts as text."""
     tensors = {f"looks.{name}": value.contiguous() for name, value in state.appearances.items()}
     tensors |= {f"shared.{name}": value.contiguous() for name, value in state.points.shared.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
@@ -146,7 +147,12 @@ def load(path: Path) -> StageState:
 
 
 def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState:
-    """The state that the tensors and facts in a file make; the columns of the points may be without values (meta).
+    """The state that the tensors and facts in a file make.
+
+    Args:
+        path: Of the file, for messages.
+        tensors: By name; the columns of the points, (N, ...), may be without values (meta).
+        text: The facts.
 
     Raises:
         BadInput: They make none.

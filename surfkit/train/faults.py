@@ -86,14 +86,14 @@ def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) ->
 
 
 def require_finite_gradients(index: int, view: str, grads: Mapping[str, Tensor]) -> None:
-    """Diverged if Adam would make values of a step that are not finite: a gradient, or its square, is not."""
+    """Diverged if Adam would make values of a step that are not finite: a gradient, (N, ...), or its square, is not."""
     for name, norm in as_numbers({name: torch.linalg.vector_norm(grad) for name, grad in grads.items()}).items():
         if not math.isfinite(norm):
             raise Diverged(index, view, f"the gradients of the {name} are not finite, or too large")
 
 
 def require_finite_values(index: int, view: str, params: Mapping[str, Tensor]) -> None:
-    """Diverged if a parameter is not finite after a step. A sum tells, in one pass and without a copy."""
+    """Diverged if a parameter, (N, ...), is not finite after a step. A sum tells, in one pass and without a copy."""
     for name, total in as_numbers({name: value.sum() for name, value in params.items()}).items():
         if not math.isfinite(total) and not torch.isfinite(params[name]).all():
             raise Diverged(index, view, f"the {name} are not finite")

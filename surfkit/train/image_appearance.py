@@ -58,7 +58,7 @@ class ImageAppearance:
         return self.model(self.numbers.to(color), color)
 
     def backward(self, losses: list[Tensor]) -> None:
-        """Find the gradient of the sum of losses, whose graph stays."""
+        """Find the gradient of the sum of losses, scalars whose graph stays."""
         if losses:
             self.grad = torch.autograd.grad(
                 reduce(torch.add, losses), self.numbers, retain_graph=True, allow_unused=True

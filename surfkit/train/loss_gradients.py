@@ -18,9 +18,12 @@ from surfkit.train.image_appearance import ImageAppearance
 
 
 def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
-    """d(sum of losses)/d(maps); None for a map without influence, but colour is always there.
+    """d(sum of losses)/d(maps), shapes of `Maps`; None for a map without influence, but colour is always there.
 
-    `shared`: other losses have part of their graph in common with these, and come later.
+    Args:
+        losses: Scalars.
+        leaves: The maps by name, (C, H, W) or (H, W).
+        shared: Other losses have part of their graph in common with these, and come later.
     """
     grads: Sequence[Tensor | None] = [None] * len(leaves)
     if losses:
@@ -72,7 +75,7 @@ def loss_gradients(
 def regularizer_terms(
     regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput
 ) -> dict[str, Tensor]:
-    """The weighted terms on the points that count in a step, by key, with their graph to the splats."""
+    """The weighted terms on the points that count in a step, scalars by key, with their graph to the splats."""
     weights = {name: term.weight_at(given.index, given.steps) for name, term in regularizers.items()}
     return {name: weight * regularizers[name].in_step(splats, given) for name, weight in weights.items() if weight > 0}
 
@@ -86,7 +89,7 @@ def as_numbers(values: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:
-    """Gradients by the raw parameters, from those by the splats and from terms on the splats.
+    """Gradients by the raw parameters, (N, ...) each, from those by the splats and from terms on the splats, scalars.
 
     A parameter without influence is left out.
     """

@@ -103,8 +103,8 @@ class NeighbourSelector:
         return found
 
     def turned_to(self, places: Tensor) -> Tensor:
-        """Positions of the cameras with some of a ball around the places in their pictures: of many, only these few
-        need be looked at place by place."""
+        """(C,) positions of the cameras with some of a ball around (3, P) places in their pictures: of many, only these
+        few need be looked at place by place."""
         middle = places.mean(1, keepdim=True)
         radius = float((places - middle).norm(dim=0).max())
         ball = (self.rotations @ middle + self.shifts)[..., 0]  # (V, 3)
