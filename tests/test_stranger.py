@@ -16,7 +16,7 @@ import torch
 from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.registry import components
-from surfkit.densify.base import Densify, Prune
+from surfkit.densify.base import Densify, Prune, Signal
 from surfkit.io.splats.ply import read_splats
 from surfkit.losses.base import Loss
 from surfkit.mesh.base import Mesher
@@ -33,8 +33,10 @@ WORDS = {
     "top-share": "pretrain.densify:top-share",
     "cards": "mesh:cards",
     "balls": "primitive:balls",
+    "blend": "pretrain.signal:blend",
 }
 KINDS = {"far": Prune, "charbonnier": Loss, "top-share": Densify, "cards": Mesher, "balls": Primitive}
+KINDS |= {"blend": Signal}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -111,7 +113,7 @@ def test_the_parts_are_listed_with_where_they_come_from(capsys):
         assert line.split()[-1] == "acme-surfkit"
     assert main(["plugins"]) == 0
     assert re.search(
-        r"acme +acme-surfkit +1.2 +far, charbonnier, top-share, cards, balls, recipe:acme, table:acme",
+        r"acme +acme-surfkit +1.2 +far, charbonnier, top-share, cards, balls, blend, recipe:acme, table:acme, command extent",
         capsys.readouterr().out,
     )
 
@@ -144,6 +146,15 @@ def test_an_interrupted_run_comes_to_the_same(train, finished, tmp_path, monkeyp
     assert "acme/grad" in whole.points.stats
 
 
+def test_the_command(finished, capsys):
+    assert main(["extent", str(finished)]) == 0
+    low, high = (tuple(map(float, line.split())) for line in capsys.readouterr().out.splitlines()[-2:])
+    means = read_splats(finished / "point_cloud.ply").means
+    assert low == pytest.approx(means.amin(0).tolist(), abs=1e-3)
+    assert high == pytest.approx(means.amax(0).tolist(), abs=1e-3)
+    assert main(["extent", "nowhere"]) == 2 and capsys.readouterr().err.count("\n") == 1
+
+
 def test_export_and_measures(finished, tmp_path):
     assert main(["export", str(finished), "--out", str(tmp_path / "points.ply")]) == 0
     assert len(read_splats(tmp_path / "points.ply").means) == len(state_of(finished).points)
@@ -169,7 +180,7 @@ def test_one_word_puts_a_part_in_the_place_of_another(train, tmp_path, name):
 
 def test_an_ablation_table_of_them_and_its_report(data, tmp_path, capsys):
     words = ["--data", str(data), "--steps", "4", "--out", str(tmp_path), "--probe", "0"]
-    rows = ["+ top share", "+ cards", "recipe of Acme"]
+    rows = ["+ top share", "+ cards", "+ blend", "recipe of Acme"]
     assert main(["ablate", "table:acme", *words, "--rows", "1", *rows, "--max-points", "130"]) == 0
     printed = capsys.readouterr().out
     assert all(row in printed for row in rows)

@@ -1,8 +1,10 @@
 """Parts of a package that surfkit knows nothing of: it imports `surfkit`, torch and numpy, and nothing else."""
 
 from acme_surfkit.balls import Balls
+from acme_surfkit.blend import Blend
 from acme_surfkit.cards import Cards
 from acme_surfkit.charbonnier import Charbonnier
+from acme_surfkit.extent import Extent
 from acme_surfkit.far import Far
 from acme_surfkit.top_share import TopShare
 from surfkit.plugin import Recipe, Row, Stage, Table, hookimpl
@@ -11,7 +13,14 @@ from surfkit.plugin import Recipe, Row, Stage, Table, hookimpl
 @hookimpl
 def surfkit_components():
     """The parts, by the names that users type."""
-    return {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards, "balls": Balls}
+    parts = {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards, "balls": Balls}
+    return parts | {"blend": Blend}
+
+
+@hookimpl
+def surfkit_commands():
+    """The command `surfkit extent`."""
+    return {"extent": Extent}
 
 
 @hookimpl
@@ -29,6 +38,7 @@ def surfkit_tables():
         Row("+ top share", {"pretrain.densify": TopShare()}),
         Row("+ far points dropped", {"pretrain.prune": (Far(),)}),
         Row("+ cards", {"mesh": Cards()}),
+        Row("+ blend", {"pretrain.signal": Blend()}),
         Row("recipe of Acme", recipe=surfkit_recipes()["acme"]),
     )
     return {"acme": Table("acme", "What each part of Acme brings.", Recipe(pretrain=Stage(steps=6)), rows)}
