@@ -261,6 +261,6 @@ def quick_alignment():
 def quick_comparison(quick_alignment):
     """What is drawn of errors, most of the rest of a comparison, is a quarter as wide too."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("errors", "measure", "class_pictures"):
-            patch.setattr(f"surfkit.evaluate.geometry.{module}.LONGEST_PX", 180)
+        for module in ("errors", "measure_geometry", "class_pictures"):
+            patch.setattr(f"surfkit.evaluate.geometry.{module}.PICTURE_LONGEST_PX", 180)
         yield

@@ -52,7 +52,7 @@ def test_the_suite_is_collected(collected, case):
     assert "tests/core/test_check.py: " in text and ("plugins/" in text or "," not in case)
     for file, package in {
         "test_fuzz.py": "hypothesis",
-        "execute/test_ray.py": "ray",
+        "runs/execute/test_ray.py": "ray",
         "mesh/test_tsdf.py": "trimesh",
     }.items():
         assert (f"tests/{file}: " in text) == (package not in case.partition(":")[2].split(",")), file

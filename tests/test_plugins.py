@@ -28,7 +28,7 @@ class Acme(Loss):
 def surfkit_components():
     return {NAME: Acme}
 """
-OFFER = "from surfkit.core.registry import hookimpl\n\n@hookimpl\ndef surfkit_component():\n    return {}\n"
+OFFER = "from surfkit import hookimpl\n\n@hookimpl\ndef surfkit_component():\n    return {}\n"
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ MOST_CALLS = 100_000
 """Calls of functions of surfkit that a command makes at most before memory gives out, where it is damaged."""
 PACKAGE = f"{Path(surfkit.__file__).parent}{os.sep}"
 """Not every folder of this name: a clone may have it."""
-GUARD = tuple(f"{PACKAGE}{name}" for name in ("cli/__init__.py", "cli/streams.py", "core/check.py"))
+GUARD = tuple(f"{PACKAGE}{name}" for name in ("cli/__init__.py", "cli/standard_streams.py", "core/check.py"))
 """Where errors become lines: memory does not give out in there."""
 
 

@@ -218,4 +218,4 @@ def test_json_is_read_in_one_place():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Attribute) and node.attr in ("load", "loads") and ast.unparse(node.value) == "json":
                 found.add(path.relative_to(root).as_posix())
-    assert found == {"core/codec.py", "testing/parts.py"}
+    assert found == {"core/codec.py", "testing/component_checks.py"}

@@ -11,7 +11,7 @@ import re, resource
 from pathlib import Path
 import numpy as np
 import torch
-from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.mesh.native_grid import NativeGrid
 from surfkit.scene.camera import Camera
 
@@ -20,7 +20,7 @@ torch.set_num_threads(2)
 def picture(side):
     depth = np.random.default_rng(0).uniform(1, 500, (side, side)).astype(np.float32)
     camera = Camera(torch.eye(4, dtype=torch.float64), side, side, side / 2, side / 2, side, side)
-    return Picture(depth, np.full(depth.shape, 32 << 24, np.uint32), camera)
+    return FusionImage(depth, np.full(depth.shape, 32 << 24, np.uint32), camera)
 
 small, large = picture(40), picture(2400)
 assert NativeGrid(Lattice(0.01, 0.04)).fuse(small, False)  # begins the threads

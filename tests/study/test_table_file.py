@@ -62,7 +62,7 @@ def changing(**change):
     [
         ("{", "not JSON: .* line 1"),
         (TABLE | {"rows": []}, "rows: there are none; give at least one"),
-        (TABLE | {"rows": [{"labl": "x"}]}, "rows.0.labl: unknown setting; RowEntry has label, change, recipe, kept, "),
+        (TABLE | {"rows": [{"labl": "x"}]}, "rows.0.labl: unknown setting; RowJson has label, change, recipe, kept, "),
         (TABLE | {"base": "2dsg"}, "base: no recipe named '2dsg'; did you mean '2dgs'?.* or give the recipe itself"),
         (TABLE | {"base": {"sed": 1}}, "base.sed: unknown setting"),
         (TABLE | {"rows": [{"label": "x", "recipe": 3}]}, "rows.0.recipe: expected an object"),
