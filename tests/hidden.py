@@ -51,13 +51,14 @@ def hide(fault: str, packages: Sequence[str]) -> None:
         sys.meta_path.insert(0, Broken(packages, RAISED[fault](LIBUSB)))
 
 
-def asking(folders: Sequence[str]) -> list[str]:
+def asking(folders: Sequence[str], package: str) -> list[str]:
     """The files of tests that ask for an optional package, and one that does not.
 
     To lack one package more is nothing new to others, which are collected where all are missing.
     """
     paths = sorted(path for folder in folders for path in Path(folder).rglob("test_*.py"))
-    return [str(path) for path in paths if path.name == "test_check.py" or re.search(r"\bneeds\(", path.read_text())]
+    asks = re.compile("needs_native" if package == NATIVE else rf'\bneeds\(\s*"{package}\b')
+    return [str(path) for path in paths if path.name == "test_check.py" or asks.search(path.read_text())]
 
 
 def main(folders: Sequence[str], cases: Sequence[str], compiled: str) -> None:
@@ -81,7 +82,7 @@ def main(folders: Sequence[str], cases: Sequence[str], compiled: str) -> None:
             gc.disable()  # it would walk through all that the parent has loaded
             hide(fault, packages.split(","))
             words = ["--collect-only", "-qq", "--tb=short", "--assert=plain", "-p", "no:cacheprovider"]
-            status = pytest.main([*words, *(asking(folders) if packages in optional else folders)])
+            status = pytest.main([*words, *(asking(folders, packages) if packages in optional else folders)])
             sys.stdout.flush()
             os._exit(status)
         print(f"== {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])}", flush=True)

@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 hypothesis = needs("hypothesis")
 pytestmark = needs_native
 BENCH = Path(__file__).parents[1] / "bench"
-CASES = 16
+CASES = 8
 TARGETS = (
     "splats-compressed-ply", "splats-gltf", "splats-gltf-spz", "splats-ply", "splats-sog", "splats-splat",
     "splats-spz", "splats-spz-4", "splats-surfkit",

@@ -122,7 +122,7 @@ def test_views_join_by_the_rule(few):
     """What is sure joins, what is excluded does not, and what is left to chance joins as often as it should."""
     sight, rule = random_scene(120), SparsePointShare(few=few)
     cells = SquareGrid(across=4, padding=0.0).cells(sight)
-    chances, times = probabilities(sight, cells, rule), 400
+    chances, times = probabilities(sight, cells, rule), 100
     joined = sum(rule.joins(replace(sight, seed=seed), cells).numpy().astype(float) for seed in range(times))
     assert (joined[chances == 1] == times).all() and (joined[chances == 0] == 0).all()
     open_ = (chances > 0) & (chances < 1)

@@ -213,7 +213,7 @@ def test_every_source_is_listed():
     assert {source.path for source, _ in SHIPPED} == set(root.rglob("*.cu"))
 
 
-@pytest.mark.parametrize("architecture", [75, 80, 86, 89, 90, 100, 120])
+@pytest.mark.parametrize("architecture", [75, 86, 90, 120])  # one of each layout of registers and shared memory
 def test_every_kernel_compiles_within_its_limits(compiler, architecture):
     if architecture not in compiler.architectures:
         pytest.skip(f"NVRTC {compiler.version} does not know sm_{architecture}")
