@@ -71,7 +71,8 @@ def _halved(mesh: Mesh, halves: Halves) -> Mesh:
     doubling vertices does not part them. Triangles with two such edges are left for the next time.
     """
     start, end, _, crowded = halves
-    faces, made, ends, touched = mesh.faces.copy(), [], [], set()
+    faces, touched = mesh.faces.copy(), set[int]()
+    made, ends = list[tuple[int, int, int]](), list[tuple[int, int]]()
     for some in crowded:
         pairs = list(_side_by_side(mesh, some, start, end))
         paired = {half for pair in pairs for half in pair}

@@ -159,6 +159,13 @@ class Maps:
         """The maps that are there, by name."""
         return {f.name: v for f in fields(self) if (v := getattr(self, f.name)) is not None}
 
+    def need(self, name: str) -> Tensor:
+        """The map of this name; ValueError if it was not asked for."""
+        found: Tensor | None = getattr(self, name)
+        if found is None:
+            raise ValueError(f"the map {name!r} was not drawn; ask for it")
+        return found
+
     def expected_depth(self) -> Tensor:
         """(H, W) depth / alpha; 0 where alpha is 0."""
         return torch.where(self.alpha > 0, self.depth / self.alpha.clamp_min(1e-10), 0.0)

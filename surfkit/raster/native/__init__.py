@@ -6,6 +6,7 @@ import importlib
 import os
 from functools import cache
 from types import ModuleType
+from typing import Any
 
 from surfkit.core.check import BadInput
 
@@ -25,6 +26,18 @@ def module() -> ModuleType | None:
             raise BadInput(f"SURFKIT_KERNELS={wanted}: this machine can run {', '.join(_native.kernels())}")
         _native.use_kernels(wanted)
     return _native
+
+
+def kernels() -> Any:
+    """The compiled extension, for those who have asked `module` whether there is one.
+
+    Raises:
+        RuntimeError: There is none.
+    """
+    found = module()
+    if found is None:
+        raise RuntimeError(lacking())
+    return found
 
 
 def lacking() -> str:
