@@ -66,8 +66,7 @@ def gather(
         ends = np.clip(box * side, *_bounds(sights, limit))
         what = "gathering points" + (f", box {at} of {len(boxes)}" if len(boxes) > 1 else "")
         for_all(sights, what, partial(_add, cells, limit), ends if len(boxes) > 1 else None)
-        keys, sums = cells.rows()
-        found.append(_points(keys, sums, side, least_weight, flat))
+        found.append(_points(cells.rows(), side, least_weight, flat))
     points = SurfacePoints(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(SurfacePoints)))
     return points.take(morton_order(points.places))
 
@@ -115,7 +114,8 @@ def cell_of(keys: np.ndarray) -> np.ndarray:
     return (np.stack([keys >> 2 * bits, keys >> bits, keys], 1) & ((1 << bits) - 1)) - (1 << (bits - 1))
 
 
-def _points(keys: np.ndarray, sums: np.ndarray, side: float, least_weight: float, flat: float) -> SurfacePoints:
+def _points(rows: tuple[np.ndarray, np.ndarray], side: float, least_weight: float, flat: float) -> SurfacePoints:
+    keys, sums = rows
     kept = sums[:, 0] >= least_weight
     cell, sums = cell_of(keys[kept]), sums[kept]
     sums[:, 1:4] += sums[:, :1] * (cell * side)
