@@ -150,8 +150,8 @@ class Codes(Encoding):
         return [slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]
 
     def _books(self, kinds: Mapping[str, ColumnType], tables: Tables) -> list[np.ndarray]:
-        books = [tables.get(f"sh.codes.{at}") for at in range(len(self.parts))]
-        fit = all(b is not None and b.ndim == 2 and b.shape[1] == d for b, d in zip(books, self.parts, strict=True))
-        if not fit or sum(self.parts) != width(kinds):
+        names = [f"sh.codes.{at}" for at in range(len(self.parts))]
+        books = [tables[name] for name in names if name in tables]
+        if [book.shape[1:] for book in books] != [(size,) for size in self.parts] or sum(self.parts) != width(kinds):
             raise BadInput(f"codebooks are missing, or not of {width(kinds)} coefficients together")
         return [book.astype(np.float32) for book in books]

@@ -33,7 +33,7 @@ from surfkit.compress.index import (
     table_shape,
 )
 from surfkit.compress.octree import MAX_LEAF_POINTS, Leaf, leaves
-from surfkit.compress.streams import packed, unpacked
+from surfkit.compress.streams import Stored, packed, unpacked
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.files import replacing
@@ -42,7 +42,8 @@ from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.scene.scene import Frame
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def write_model(
@@ -85,7 +86,7 @@ def write_model(
             rows = torch.from_numpy(leaf.rows)
             values = {name: value[rows] for name, value in (points | plan.marks).items()}
             refuse_not_finite(values)
-            streams = {}
+            streams: dict[str, np.ndarray | Stored] = {}
             for encoding in plan.encodings:
                 streams |= encoding.encode(values, kinds, leaf, plan.tables)
             return leaf, packed(streams)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.octree import Leaf
-from surfkit.compress.streams import Stored, Streams
+from surfkit.compress.streams import Streams, array
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.primitives.columns import IDENTITY, Activation
@@ -93,10 +93,10 @@ def stream(streams: Streams, name: str, rows: int, components: int) -> np.ndarra
     if found is None or found.shape != (rows, components):
         what = "is missing" if found is None else f"is {found.shape[0]} x {found.shape[1]}"
         raise BadInput(f"stream {name} {what}; {rows} x {components} are needed")
-    return found.numbers() if isinstance(found, Stored) else found
+    return array(found)
 
 
-def from_whole(name: str, numbers: np.ndarray) -> Streams:
+def from_whole(name: str, numbers: np.ndarray) -> dict[str, np.ndarray]:
     """Streams of (n, components) whole numbers of any sign, as differences from their medians.
 
     Raises:

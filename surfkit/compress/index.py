@@ -18,7 +18,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -174,8 +174,12 @@ def place_of(frame: Frame | None) -> FrameEntry | None:
     """A frame as the index has it."""
     if frame is None:
         return None
-    origin = tuple(float(value) for value in frame.origin)
-    return FrameEntry(origin, frame.scale, frame.metres, frame.crs, tuple(float(value) for value in frame.shift))
+
+    def three(place: Iterable[float]) -> tuple[float, float, float]:
+        x, y, z = place
+        return float(x), float(y), float(z)
+
+    return FrameEntry(three(frame.origin), frame.scale, frame.metres, frame.crs, three(frame.shift))
 
 
 def refuse_unencoded(encodings: tuple[Encoding, ...], columns: Mapping[str, ColumnType | ColumnEntry]) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from surfkit.compress.cuda import codes as gpu
 from surfkit.compress.nearest import CPU, DistanceBounds, Search, checked, itself, nearest, searching
 from surfkit.core.check import BadInput, expect
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 
 __all__ = ["kmeans", "nearest"]
 
@@ -278,7 +278,7 @@ def halve(vectors: Tensor, middles: np.ndarray, directions: np.ndarray, index: T
     """(N,) int32: twice the code, and one more for vectors ahead of its middle in its direction."""
     if vectors.device.type == "cpu" and module() is not None:
         halved = index.clone()
-        module().halve(vectors.numpy(), middles, directions, halved.numpy(), torch.get_num_threads())
+        kernels().halve(vectors.numpy(), middles, directions, halved.numpy(), torch.get_num_threads())
         return halved
     ahead, code = torch.zeros(len(index), dtype=torch.float64, device=index.device), index.long()
     columns = (torch.from_numpy(np.ascontiguousarray(each.T)).to(index.device) for each in (middles, directions))
@@ -294,7 +294,7 @@ def sums(vectors: Tensor, weights: Tensor, index: Tensor, codes: int) -> np.ndar
     rows, weight, code = vectors.numpy(), weights.numpy(), index.numpy()
     if module() is not None:
         total = np.zeros((codes, rows.shape[1] + 1))
-        module().sum_by_code(rows, weight, code, total, torch.get_num_threads())
+        kernels().sum_by_code(rows, weight, code, total, torch.get_num_threads())
         return total
     columns = [weight, *(weight * column for column in rows.T.astype(np.float64))]
     return np.stack([np.bincount(code, column, codes) for column in columns[1:] + columns[:1]], 1)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.core.check import BadInput, expect
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 
 CPU = torch.device("cpu")
 MAX_VECTOR_VALUE = 1e15
@@ -176,7 +176,7 @@ class NativeSearch(Search):
     def __init__(self, codebook: Tensor, features: DistanceBounds) -> None:
         self.work = len(codebook) * (features.used + 4)
         arrays = codebook, features(codebook), features.order(codebook)
-        self.codes = module().Codebook(*(array.numpy() for array in arrays))
+        self.codes = kernels().Codebook(*(array.numpy() for array in arrays))
 
     def parts(self, rows: int) -> Iterator[slice]:
         threads = torch.get_num_threads()
@@ -187,7 +187,7 @@ class NativeSearch(Search):
         index, distance = torch.empty(len(vectors), dtype=torch.int32), torch.empty(len(vectors))
         given = vectors, features, without, index, distance
         arrays = (None if array is None else array.numpy() for array in given)
-        self.codes.nearest(*arrays, module().kernels_in_use(), torch.get_num_threads())
+        self.codes.nearest(*arrays, kernels().kernels_in_use(), torch.get_num_threads())
         return index, distance
 
 
@@ -225,4 +225,7 @@ def searching(codebook: Tensor, features: Callable[[Tensor], Tensor], device: to
     """The codebook on a device: for a GPU, or compiled if surfkit is."""
     if device.type == "cuda":
         return GpuSearch(codebook, device)
-    return NativeSearch(codebook, features) if module() is not None else TorchSearch(codebook)
+    if module() is None:
+        return TorchSearch(codebook)
+    assert isinstance(features, DistanceBounds), "a search on the CPU is given the features of its codes"
+    return NativeSearch(codebook, features)

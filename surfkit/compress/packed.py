@@ -74,7 +74,8 @@ def shape_encodings(
         position: Share of the median radius; None gives positions 16 bits in their leaf.
         scale, rotation, opacity: See `Packed`.
     """
-    kinds, found = kinds_of(model), {}
+    kinds = kinds_of(model)
+    found: dict[tuple[str, ...], Encoding] = {}
     found["means",] = MortonPositions("means", None if position is None else position_exponent(model, position, scale))
     if "scales" in kinds and _are_lengths(model, kinds["scales"]):
         found["scales",] = LogSteps("scales", scale)

@@ -72,7 +72,7 @@ class Stored:
             start = stop
         return found.T
 
-    def _plane(self, part: memoryview, coded: bool) -> np.ndarray:
+    def _plane(self, part: memoryview | bytes, coded: bool) -> np.ndarray:
         import zstandard
 
         if coded:
@@ -93,13 +93,19 @@ Streams = Mapping[str, np.ndarray | Stored]
 """Arrays by name, (rows, components) of an unsigned type each; those of a file are not decoded yet."""
 
 
-def packed(streams: Mapping[str, np.ndarray]) -> bytes:
+def array(stream: np.ndarray | Stored) -> np.ndarray:
+    """The numbers of a stream; BadInput if it is damaged."""
+    return stream.numbers() if isinstance(stream, Stored) else stream
+
+
+def packed(streams: Streams) -> bytes:
     """The bytes of arrays, each (rows, components) of an unsigned type."""
     import zstandard
 
     coder = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
     head, body = [struct.pack("<B", len(streams))], []
-    for name, numbers in streams.items():
+    for name, stream in streams.items():
+        numbers = array(stream)
         if numbers.dtype.kind != "u" or numbers.ndim != 2 or numbers.shape[1] > MAX_COMPONENTS:
             raise TypeError(
                 f"stream {name}: {numbers.dtype} {numbers.shape}; it must be unsigned, with two axes and at most "

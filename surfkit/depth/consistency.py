@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from surfkit.depth.cost_volume import ray_map, way_numbers
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
 
 
@@ -36,18 +36,18 @@ class DepthConsistency(NamedTuple):
     """What other maps say of the pixels of a map.
 
     Attributes:
-        count: (H, W) number of maps that agree.
+        agreeing: (H, W) number of maps that agree.
         shown: (H, W) number of maps that have a depth in the same place, whether it agrees or not.
         fused: (H, W) inverse depth, the mean of what the maps that agree and the map itself say.
     """
 
-    count: Tensor
+    agreeing: Tensor
     shown: Tensor
     fused: Tensor
 
     def trust(self, enough: int) -> Tensor:
         """(H, W) in [0, 1]: 1 where `enough` maps agree, or all that show the place if fewer do, but 2 at least."""
-        return (self.count / self.shown.clamp(2, max(2, enough))).clamp_max(1)
+        return (self.agreeing / self.shown.clamp(2, max(2, enough))).clamp_max(1)
 
 
 def agreement(
@@ -67,7 +67,7 @@ def agreement(
     if module() is None or inverse.device.type != "cpu":
         return agreement_in_torch(camera, inverse, others, tolerance)
     made = [np.empty(inverse.shape, np.float32) for _ in range(3)]
-    module().depth_agreement(
+    kernels().depth_agreement(
         np.ascontiguousarray(inverse.numpy(), np.float32),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         [np.ascontiguousarray(other.numpy(), np.float32) for _, other in others],

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.raster.native import lacking, module
+from surfkit.raster.native import kernels, lacking, module
 from surfkit.scene.camera import Camera
 
 BRIGHTNESS_PIXELS = 2000
@@ -42,13 +42,13 @@ class GreyImage:
 
         Continued by a border of b pixels, and one more to the right.
         """
-        border = module().STEREO_BORDER
+        border = kernels().STEREO_BORDER
         wide = np.pad(self.value, (border, border + 1), mode="edge").astype(np.uint16)
         return wide[:-1] | wide[1:] << 8
 
     def padded(self) -> np.ndarray:
         """(H + 2 r, W + 2 r) float32, continued by the radius of the windows."""
-        return np.pad(self.value, module().STEREO_RADIUS, mode="edge").astype(np.float32)
+        return np.pad(self.value, kernels().STEREO_RADIUS, mode="edge").astype(np.float32)
 
 
 @dataclass
@@ -138,7 +138,7 @@ def improve(
     """
     camera = here.camera
     ways = [[*way(camera, other.camera), *way(other.camera, camera)] for other in others]
-    module().patch_match(
+    kernels().patch_match(
         here.padded(),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         pattern(terms.window),
@@ -155,7 +155,7 @@ def improve(
         terms.best,
         terms.survey,
         seed % 2**32,
-        module().kernels_in_use(),
+        kernels().kernels_in_use(),
         torch.get_num_threads(),
     )
 
@@ -172,7 +172,7 @@ def pattern(window: int) -> np.ndarray:
     The first half are those of a grid that is spread over the window, and the others those of a finer one that are
     nearest to the middle. Each has its opposite, but for one of these where an odd number of places is left for them.
     """
-    room, half = module().STEREO_SAMPLES, window // 2
+    room, half = kernels().STEREO_SAMPLES, window // 2
     side = np.rint(np.linspace(-half, half, min(window, math.isqrt(room // 2)))).astype(int).tolist()
     chosen = [(x, y) for y in side for x in side]
     step = max(1, half // 3)

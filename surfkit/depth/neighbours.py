@@ -35,7 +35,8 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
         count: Of neighbours.
         angle: Between rays, degrees.
     """
-    rows = [observations.seen[view.name].points if view.name in observations.seen else [] for view in views]
+    nothing = np.empty(0, np.int64)
+    rows = [observations.seen[view.name].points if view.name in observations.seen else nothing for view in views]
     ends = np.cumsum([0, *(len(row) for row in rows)])
     columns = np.concatenate([np.asarray(row, np.int64) for row in rows])
     sees = csr_matrix((np.ones(len(columns), np.int32), columns, ends), (len(views), len(observations.xyz)))

@@ -233,7 +233,7 @@ class PatchMatchWorkspace:
         self.rounds = [self.round(MATCHING_PHASE, self.match, kept)]
         for index in range(1, self.number_of_rounds):
             again, before = f", round {index}" if index > 1 else "", self.rounds[-1]
-            self.rounds.append(self.round(COMPARING_PHASE + again, lambda at, of=before: self.reconcile(at, of), kept))
+            self.rounds.append(self.round(COMPARING_PHASE + again, partial(self.reconcile, before=before), kept))
         self.last = self.rounds[-1]
         for each in reversed(self.rounds):
             each.made.update(at for at in every if self.path(each.what, at).exists() or not self.is_needed(each, at))

@@ -129,10 +129,10 @@ class PlaneSweep(DepthEstimator):
                 continue
             inverse, matched = maps.pop(at)
             others = [(picture(near).camera, found) for near, (found, _) in maps.items()]
-            found = agreement(picture(at).camera, inverse, others, self.tolerance)
-            trusted = found.trust(self.agree)
+            said = agreement(picture(at).camera, inverse, others, self.tolerance)
+            trusted = said.trust(self.agree)
             trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
-            yield Estimate(at, found.fused.cpu(), (trusted * matched).cpu())
+            yield Estimate(at, said.fused.cpu(), (trusted * matched).cpu())
 
     def picture(self, given: DepthInput, at: int) -> PosedImage:
         """A photograph at the working size."""

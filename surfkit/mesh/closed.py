@@ -239,10 +239,14 @@ def _fanned(mesh: Mesh, loops: list[np.ndarray]) -> Mesh:
 def _with_vertices(mesh: Mesh, places: np.ndarray, colors: np.ndarray | None) -> Mesh:
     """The mesh with more vertices, that no view has seen."""
     unknown = {"views": 0.0, "error": np.nan}
+    shades = mesh.colors
+    if shades is not None:
+        assert colors is not None, "new vertices have colours where the others have"
+        shades = np.concatenate([shades, np.rint(colors).astype(np.uint8)])
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, places.astype(np.float32)]),
-        colors=None if mesh.colors is None else np.concatenate([mesh.colors, np.rint(colors).astype(np.uint8)]),
+        colors=shades,
         values={
             name: np.concatenate([each, np.full(len(places), unknown[name], np.float32)])
             for name, each in mesh.values.items()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 
 UNDECIDED = -1
 LAST = np.iinfo(np.int32).max
@@ -72,7 +72,7 @@ def tiles(places: np.ndarray, most: int, halo: float) -> list[TetraTile]:
     tile_of, last = np.empty((2, len(places)), np.int32)
     for number, (own, around) in enumerate(found):
         tile_of[own], last[around] = number, number
-    step = max(module().least_step(np.ascontiguousarray(places[around], np.float64)) for _, around in found)
+    step = max(kernels().least_step(np.ascontiguousarray(places[around], np.float64)) for _, around in found)
 
     def tile(number: int, rows: np.ndarray) -> TetraTile:
         title = f", tile {number + 1} of {len(found)}" if len(found) > 1 else ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 
 TETRA_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 """Vertices of the edges of a tetrahedron."""
@@ -146,6 +146,6 @@ def tetrahedralised(points: np.ndarray, step: float = 0.0) -> Tetrahedra:
         step: 0 for the least that can be had, a millionth of the extent of the points.
     """
     given = np.ascontiguousarray(points, np.float64)
-    step = step or module().least_step(given)
-    corners, neighbours, enclosing, _ = module().tetrahedralise(given, step)
+    step = step or kernels().least_step(given)
+    corners, neighbours, enclosing, _ = kernels().tetrahedralise(given, step)
     return Tetrahedra(np.concatenate([points, enclosing]), corners, neighbours)

@@ -107,11 +107,11 @@ def vertex_colors(subject: MeshInput, vertices: np.ndarray) -> np.ndarray:
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for index, view in enumerate(subject.views):
         maps, places = subject.draw(view), view.camera.project(points)
-        depth = shown(maps.median, places)
+        depth = shown(maps.need("median"), places)
         z = places[:, 2].float()
         # A far pixel says less of a place than a near one.
         seen = ((depth - z).abs() < MAX_SEEN_OFFSET * z) / z.square().clamp_min(1e-12)
-        total += seen[:, None] * shown(maps.color, places)
+        total += seen[:, None] * shown(maps.need("color"), places)
         weight += seen[:, None]
         emit(Progress("colouring", index + 1, len(subject.views)))
     mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.5)

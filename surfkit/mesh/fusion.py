@@ -225,11 +225,11 @@ def spooled(task: FusionTask) -> Iterator[FusionTask]:
             return FusionImage(depth.view(np.float32), shade, task.cameras[at], slant.view(np.float32))
 
         if task.compare is not None:
-            compare(task, folder)
+            compare(task, task.compare, folder)
         yield replace(task, see=read, compare=None, stored=True)
 
 
-def compare(task: FusionTask, folder: Path) -> None:
+def compare(task: FusionTask, trust_of: Callable[[int, Depths], Tensor], folder: Path) -> None:
     """Multiply the weights of the views on disk; depths stay, so the order of the views does not matter."""
 
     def depth(at: int) -> Tensor:
@@ -237,7 +237,7 @@ def compare(task: FusionTask, folder: Path) -> None:
 
     depths = Depths(task.cameras, depth)
     for at in range(len(task.cameras)):
-        trust = task.compare(at, depths).numpy()
+        trust = trust_of(at, depths).numpy()
         shade = np.load(folder / f"{at}.npy", mmap_mode="r+")[1]
         shade[:] = weighed(np.asarray(shade), trust)
         emit(Progress("comparing views", at + 1, len(task.cameras)))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.mesh.lattice import FULL_WEIGHT, FusionImage, least_slant
 from surfkit.raster.api import Maps
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
 
 F = np.float32
@@ -23,7 +23,10 @@ MIN_DEPTH_ALPHA = 0.5
 
 def depth_of(maps: Maps, which: Which) -> Tensor:
     """(H, W) camera z; 0 where there is none or it is not finite."""
-    depth = maps.median if which == "median" else torch.where(maps.alpha >= MIN_DEPTH_ALPHA, maps.expected_depth(), 0.0)
+    if which == "median":
+        depth = maps.need("median")
+    else:
+        depth = torch.where(maps.need("alpha") >= MIN_DEPTH_ALPHA, maps.expected_depth(), 0.0)
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
@@ -40,15 +43,16 @@ def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float, truncation:
         voxel: Local units.
         truncation: Local units.
     """
-    planes = [None if plane is None else plane.float().contiguous().numpy() for plane in (maps.color, maps.normal)]
+    color = maps.need("color").float().contiguous().numpy()
+    normal = None if maps.normal is None else maps.normal.float().contiguous().numpy()
     near, plain = voxel * min(camera.fx, camera.fy), depth.float().contiguous().numpy()
     least = least_slant(voxel, truncation)
     if module() is None:
-        made, slant = shade(plain, planes[0], planes[1], camera, near, least)
+        made, slant = shade(plain, color, normal, camera, near, least)
         return FusionImage(plain, made, camera, slant)
     made, slant = np.empty(plain.shape, np.uint32), np.empty(plain.shape, F)
-    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-    module().shade(plain, *planes, lens, near, least, made, slant, module().kernels_in_use(), torch.get_num_threads())
+    lens, native = [camera.fx, camera.fy, camera.cx, camera.cy], kernels()
+    native.shade(plain, color, normal, lens, near, least, made, slant, native.kernels_in_use(), torch.get_num_threads())
     return FusionImage(plain, made, camera, slant)
 
 

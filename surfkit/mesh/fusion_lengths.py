@@ -62,19 +62,18 @@ def resolve(
     Raises:
         BadInput: There is no depth in any view, or lengths are in metres and nobody knows how long a unit is.
     """
-    given = [to_local(value, subject.frame) for value in (voxel, truncation, limit)]
-    if given[0] is None or given[2] is None:
+    size, cut, most = (to_local(value, subject.frame) for value in (voxel, truncation, limit))
+    if size is None or most is None:
         depth, pixel, far = look(subject, which)
-        given[0] = given[0] or voxel_px * pixel
-        given[2] = given[2] or max(DEPTH_LIMIT_MEDIANS * depth, far)
-    size, cut, far = given
+        size = size or voxel_px * pixel
+        most = most or max(DEPTH_LIMIT_MEDIANS * depth, far)
     cut = cut or truncation_voxels * size
     if cut < MIN_TRUNCATION_VOXELS * size:
         raise BadInput(
             f"mesh.truncation is {with_unit(cut, subject.frame)} with voxels of {with_unit(size, subject.frame)}; "
             f"it must be at least {MIN_TRUNCATION_VOXELS:g} voxels"
         )
-    return Lengths(size, cut, far)
+    return Lengths(size, cut, most)
 
 
 def with_unit(length: float, frame: Frame) -> str:
@@ -103,7 +102,9 @@ def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
     Views without depth are passed over for others.
     """
     count, first = len(subject.views), sampled(subject)
-    depths, pixels, seen = [], [], []
+    depths: list[float] = []
+    pixels: list[float] = []
+    seen: list[Tensor] = []
     for at in [*first, *sorted(set(range(count)) - set(first))]:
         if len(depths) >= len(first) // 2 + 1 and at not in first:
             break

@@ -15,7 +15,7 @@ from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.trust import Trust
 from surfkit.raster.api import Maps
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
 
 MIN_CONTRADICTING_CONFIDENCE = 0.375
@@ -151,7 +151,7 @@ def compare(
         return compare_in_torch(camera, depth, there, other, tolerance)
     turn = camera.world_to_camera @ torch.linalg.inv(there.world_to_camera)
     made = [np.empty(depth.shape, np.float32) for _ in range(3)]
-    module().compare_depths(
+    kernels().compare_depths(
         *(np.ascontiguousarray(some.numpy(), np.float32) for some in (depth, other)),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         way_numbers(camera, there),

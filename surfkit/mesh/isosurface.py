@@ -118,8 +118,8 @@ def _faces(inside: np.ndarray, start: np.ndarray, edges: np.ndarray) -> np.ndarr
         case |= inside[dz : dz + depth, dy : dy + height, dx : dx + width].astype(np.int32) << at
     z, y, x = np.nonzero((case > 0) & (case < 255))
     listed = triangles()[case[z, y, x]]
-    at, place = np.nonzero(listed >= 0)
-    edge = CUBE_EDGES[listed[at, place]]
-    names = name_edges((start + np.stack([x, y, z], 1))[at] + edge[:, :3], edge[:, 3])
+    row, place = np.nonzero(listed >= 0)
+    edge = CUBE_EDGES[listed[row, place]]
+    names = name_edges((start + np.stack([x, y, z], 1))[row] + edge[:, :3], edge[:, 3])
     order = np.argsort(edges)
     return order[np.searchsorted(edges[order], names)].astype(np.int32).reshape(-1, 3)

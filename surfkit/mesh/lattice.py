@@ -129,8 +129,15 @@ class SurfacePatch:
 class TsdfGrid(ABC):
     """Distances, weights and colours of the voxels near surfaces."""
 
-    blocks: int
-    bytes: int
+    @property
+    @abstractmethod
+    def blocks(self) -> int:
+        """Blocks that there are."""
+
+    @property
+    @abstractmethod
+    def bytes(self) -> int:
+        """Memory that they take."""
 
     @abstractmethod
     def fuse(self, picture: FusionImage, carve: bool) -> bool:

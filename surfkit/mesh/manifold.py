@@ -71,7 +71,10 @@ def _halved(mesh: Mesh, halves: Halves) -> Mesh:
     doubling vertices does not part them. Triangles with two such edges are left for the next time.
     """
     start, end, _, crowded = halves
-    faces, made, ends, touched = mesh.faces.copy(), [], [], set()
+    faces = mesh.faces.copy()
+    made: list[tuple[int, int, int]] = []
+    ends: list[tuple[int, int]] = []
+    touched: set[int] = set()
     for some in crowded:
         pairs = list(_side_by_side(mesh, some, start, end))
         paired = {half for pair in pairs for half in pair}

@@ -17,7 +17,7 @@ from surfkit.mesh.lattice import (
     SurfacePatch,
 )
 from surfkit.mesh.reference_grid import ReferenceGrid
-from surfkit.raster.native import lacking, module
+from surfkit.raster.native import kernels, lacking, module
 
 
 class NativeGrid(HostGrid):
@@ -26,7 +26,7 @@ class NativeGrid(HostGrid):
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
         corners = list(lattice.low), list(lattice.high)
-        self.native = module().Grid(lattice.voxel, BLOCK_REACH_VOXELS * lattice.voxel, *corners, lattice.most_blocks)
+        self.native = kernels().Grid(lattice.voxel, BLOCK_REACH_VOXELS * lattice.voxel, *corners, lattice.most_blocks)
 
     @property
     def blocks(self) -> int:
@@ -47,7 +47,7 @@ class NativeGrid(HostGrid):
             self.lattice.offsets(camera),
             self.lattice.lengths,
             carve,
-            module().kernels_in_use(),
+            kernels().kernels_in_use(),
             torch.get_num_threads(),
         )
 

@@ -63,7 +63,8 @@ def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
         return []
     near = nearby(at, depths, float(np.quantile(np.linalg.norm(points - eye, axis=1), 0.9)))
     worths = np.array([_worth(points, eye, depths.cameras[other], angle) for other in near])
-    covered, chosen = np.zeros(len(points)), []
+    covered = np.zeros(len(points))
+    chosen: list[int] = []
     while len(chosen) < min(count, len(near)):
         gains = (worths / (1 + covered)).sum(1)
         best = int(gains.argmax())

@@ -93,17 +93,18 @@ def seen_pixels(subject: MeshInput, at: int, most: int, which: Literal["median",
     """
     view = subject.views[at]
     camera, maps = view.camera, subject.draw(view)
-    depth = maps.median if which == "median" else maps.expected_depth()
-    length = maps.normal.norm(dim=0)
-    solid = (depth > 0) & (maps.alpha > 0.5) & (length > 0)
+    depth = maps.need("median") if which == "median" else maps.expected_depth()
+    normal = maps.need("normal")
+    length = normal.norm(dim=0)
+    solid = (depth > 0) & (maps.need("alpha") > 0.5) & (length > 0)
     if (keep := subject.keep(at)) is not None:
         solid &= keep
     rows = solid.flatten().nonzero()[:, 0]
     rows = rows[torch.randperm(len(rows), generator=subject.generator)[:most].sort().values]
     turn, rays = camera.world_to_camera[:3, :3].float(), camera.rays()
     local = (rays * depth).flatten(1)[:, rows].T
-    normals = (maps.normal / length.clamp_min(1e-10)).flatten(1)[:, rows].T
-    colors = maps.color.clamp(0, 1).flatten(1)[:, rows].T
+    normals = (normal / length.clamp_min(1e-10)).flatten(1)[:, rows].T
+    colors = maps.need("color").clamp(0, 1).flatten(1)[:, rows].T
     emit(Progress("taking points", at + 1, len(subject.views)))
     directions = torch.nn.functional.normalize(rays.flatten(1)[:, rows].T @ turn, dim=1)
     return SeenPixels(local @ turn + camera.centre.float(), directions, normals @ turn, colors)

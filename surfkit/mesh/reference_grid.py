@@ -143,7 +143,7 @@ class ReferenceGrid(HostGrid):
     ) -> SurfacePatch:
         values, colors = self._corners(least_weight)  # (B, 9, 9, 9): z, y, x
         here = values[:, :BLOCK_SIDE_VOXELS, :BLOCK_SIDE_VOXELS, :BLOCK_SIDE_VOXELS]
-        block, base = np.arange(self.blocks), unpack(self.keys) * BLOCK_SIDE_VOXELS
+        base = unpack(self.keys) * BLOCK_SIDE_VOXELS
         parts = []
         for axis in range(3):
             step = np.eye(3, dtype=int)[axis][::-1]
@@ -160,7 +160,7 @@ class ReferenceGrid(HostGrid):
             parts.append((rows, where * self.lattice.voxel, mixed, name_edges(lattice, axis)))
         order = np.argsort(np.concatenate([part[0] for part in parts]), kind="stable")  # by block, axis, voxel
         vertices, shades, edges = (np.concatenate([part[i] for part in parts])[order] for i in (1, 2, 3))
-        faces = self._faces(values, (unpack(self.keys) < np.array(end)).all(1)[block], edges)
+        faces = self._faces(values, np.all(unpack(self.keys) < np.array(end), axis=1), edges)
         return SurfacePatch(vertices.astype(F), faces, shades, edges if with_edges else edges[:0])
 
     def _corners(self, least_weight: int) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +196,9 @@ class ReferenceGrid(HostGrid):
             for dz, dy, dx in np.ndindex(2, 2, 2)
         ]  # in the order of their numbers
         whole = np.logical_and.reduce([c != 0 for c in corners]) & wanted[:, None, None, None]
-        case = sum((c < 0).astype(np.int32) << at for at, c in enumerate(corners))
+        case = np.zeros(whole.shape, np.int32)
+        for bit, corner in enumerate(corners):
+            case |= (corner < 0).astype(np.int32) << bit
         rows, z, y, x = np.nonzero(whole & (case > 0) & (case < 255))
         listed = triangles()[case[rows, z, y, x]]
         cell = unpack(self.keys)[rows] * BLOCK_SIDE_VOXELS + np.stack([x, y, z], 1)

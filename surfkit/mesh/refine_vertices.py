@@ -9,7 +9,7 @@ import torch
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.view_observations import ViewObservations, boxes_of, for_all
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 
 ADJUSTMENT_ROUNDS = 2
 """How often vertices are looked for in the views."""
@@ -81,7 +81,7 @@ class VertexTargets:
         """Look at (V, 3) places, whose unit normals are (V, 3), in all views; the lengths are those of `adjusted`."""
         sums, weights, squares, views = np.zeros((4, len(places)), np.float32)
         at = places.astype(np.float32)
-        native, threads = module(), torch.get_num_threads()
+        native, threads = kernels(), torch.get_num_threads()
         job = at, boxes_of(at), normals.astype(np.float32), reach, near, sums, weights, squares, views
         for_all(sights, "adjusting", lambda sight: native.pull(*job, *sight.native, threads))
         wanted = places + normals * (sums / np.maximum(weights, 1e-6))[:, None]

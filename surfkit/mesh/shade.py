@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.mesh.base import Mesh
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
 
 BACKGROUND = 1.0
@@ -38,7 +38,7 @@ def draw_faces(vertices: np.ndarray, faces: np.ndarray, width: int, height: int)
     face = np.full((height, width), -1, np.int32)
     vertices, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32)
     if module() is not None:
-        module().draw_faces(vertices, faces, depth, face, torch.get_num_threads())
+        kernels().draw_faces(vertices, faces, depth, face, torch.get_num_threads())
     else:
         draw_in_numpy(vertices, faces, depth, face)
     return depth, face

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
-from surfkit.raster.native import lacking, module
+from surfkit.raster.native import kernels, lacking, module
 
 COLLAPSE_COST_FACTOR = 6.0
 """What a collapse may cost, in squares of the length that is allowed: then 99 of 100 places stay within it."""
@@ -65,7 +65,7 @@ def collapsed(
     """
     vertices, faces = np.ascontiguousarray(mesh.vertices, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
     fixed = np.zeros(len(vertices), np.uint8) if fixed is None else fixed.astype(np.uint8)
-    return module().collapse(vertices, faces, max(1, most), limit, fixed, flat)
+    return kernels().collapse(vertices, faces, max(1, most), limit, fixed, flat)
 
 
 def _means(column: np.ndarray, into: np.ndarray, count: int) -> np.ndarray:
@@ -103,7 +103,7 @@ def simplify_to(mesh: Mesh, count: int) -> Mesh:
     used, corners = np.unique(faces, return_inverse=True)
     vertices = (places[used] / unit + middle).astype(np.float32)
     found = replace(mesh, vertices=vertices, faces=corners.reshape(-1, 3).astype(np.int32), colors=None)
-    return found if mesh.colors is None else replace(found, colors=_mean_colors(mesh, vertices))
+    return found if mesh.colors is None else replace(found, colors=_mean_colors(mesh.vertices, mesh.colors, vertices))
 
 
 def _mean_edge(mesh: Mesh) -> float:
@@ -111,16 +111,16 @@ def _mean_edge(mesh: Mesh) -> float:
     return float(np.linalg.norm(mesh.vertices[some[:, 1]] - mesh.vertices[some[:, 0]], axis=1).mean())
 
 
-def _mean_colors(mesh: Mesh, vertices: np.ndarray) -> np.ndarray:
-    """(V, 3) uint8 of fewer vertices: the mean of the vertices of the mesh that are nearest to each, or of the next."""
+def _mean_colors(before: np.ndarray, shades: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """(V, 3) uint8 of fewer vertices: the mean of those before that are nearest to each, or of the next."""
     tree = KDTree(vertices)
     sums, counts = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
-    for at in range(0, len(mesh.vertices), 1 << 20):
+    for at in range(0, len(before), 1 << 20):
         part = slice(at, at + (1 << 20))
-        nearest = tree.query(mesh.vertices[part], workers=-1)[1]
+        nearest = tree.query(before[part], workers=-1)[1]
         counts += np.bincount(nearest, minlength=len(vertices))
         for channel in range(3):
-            sums[:, channel] += np.bincount(nearest, mesh.colors[part, channel], len(vertices))
+            sums[:, channel] += np.bincount(nearest, shades[part, channel], len(vertices))
     known = counts > 0
     means = sums[known] / counts[known, None]
     colors = np.empty((len(vertices), 3), np.uint8)

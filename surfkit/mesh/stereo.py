@@ -44,7 +44,8 @@ class Stereo(Mesher):
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
-        if subject.priors is None:
+        priors = subject.priors
+        if priors is None:
             raise BadInput(
                 "mesh:stereo fuses depth priors, and there are none that can be used; "
                 "make some with `surfkit prepare depth DATA`"
@@ -53,7 +54,7 @@ class Stereo(Mesher):
 
         def draw(view: View, coloured: bool = True) -> Maps:
             at = places[view.name]
-            prior = subject.priors[at]  # there is none of a damaged photograph
+            prior = priors[at]  # there is none of a damaged photograph
             photo = None if prior is None or subject.photo is None or not coloured else subject.photo(at)
             return seen(view, prior, photo, self.min_confidence)
 
@@ -87,7 +88,7 @@ def seen(view: View, prior: DepthPrior | None, photo: Tensor | None, least: floa
 
 def points(views: Sequence[View], draw: Callable[[View], Maps]) -> Splats:
     """Points of the maps, evenly from all views, as splats that tell where the surface is."""
-    found = [_points(view, draw(view).median, max(1, SAMPLED_MAP_POINTS // len(views))) for view in views]
+    found = [_points(view, draw(view).need("median"), max(1, SAMPLED_MAP_POINTS // len(views))) for view in views]
     means = torch.cat(found) if found else torch.empty(0, 3)
     count = len(means)
     one = torch.ones(count, 4)

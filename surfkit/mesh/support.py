@@ -7,7 +7,7 @@ import torch
 
 from surfkit.mesh.refine_vertices import beside
 from surfkit.mesh.view_observations import ViewObservations, boxes_of, for_all
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 
 
 def supported(
@@ -27,7 +27,7 @@ def supported(
         least_views: That confirm a face: each has a depth within half a cell of it.
         guesses: Width of the disc, cells.
     """
-    native, threads = module(), torch.get_num_threads()
+    native, threads = kernels(), torch.get_num_threads()
     corners = points[faces]
     middles = corners.mean(1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

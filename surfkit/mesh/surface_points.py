@@ -10,7 +10,7 @@ import numpy as np
 
 from surfkit.mesh.delaunay import split
 from surfkit.mesh.view_observations import ViewObservation, ViewObservations, for_all
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 from surfkit.scene.morton import morton_order
 
 MERGE_LEVELS = 2
@@ -62,11 +62,11 @@ def gather(
     boxes = boxes_with(sights, side, limit, most)
     found = []
     for at, box in enumerate(boxes, 1):
-        cells = module().Cells(side, *box.tolist())
+        cells = kernels().Cells(side, *box.tolist())
         ends = np.clip(box * side, *_bounds(sights, limit))
         what = "gathering points" + (f", box {at} of {len(boxes)}" if len(boxes) > 1 else "")
         for_all(sights, what, partial(_add, cells, limit), ends if len(boxes) > 1 else None)
-        found.append(_points(*cells.rows(), side, least_weight, flat))
+        found.append(_points(cells.rows(), side, least_weight, flat))
     points = SurfacePoints(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(SurfacePoints)))
     return points.take(morton_order(points.places))
 
@@ -87,9 +87,9 @@ def boxes_with(sights: ViewObservations, side: float, limit: float, most: int) -
     They fill space, and cells that may become one lie in the same box. Their number is estimated from every fourth
     pixel and cells four times as large.
     """
-    half = 1 << (module().CELL_BITS - 1)
+    half = 1 << (kernels().CELL_BITS - 1)
     whole = np.array([[-half] * 3, [half] * 3])
-    coarse = module().Cells(COARSE_SIDE_CELLS * side, *whole.tolist())
+    coarse = kernels().Cells(COARSE_SIDE_CELLS * side, *whole.tolist())
 
     def add(sight: ViewObservation) -> None:
         camera = sight.camera
@@ -110,11 +110,12 @@ def boxes_with(sights: ViewObservations, side: float, limit: float, most: int) -
 
 def cell_of(keys: np.ndarray) -> np.ndarray:
     """(N, 3) int64 cells with these keys."""
-    bits = module().CELL_BITS
+    bits = kernels().CELL_BITS
     return (np.stack([keys >> 2 * bits, keys >> bits, keys], 1) & ((1 << bits) - 1)) - (1 << (bits - 1))
 
 
-def _points(keys: np.ndarray, sums: np.ndarray, side: float, least_weight: float, flat: float) -> SurfacePoints:
+def _points(rows: tuple[np.ndarray, np.ndarray], side: float, least_weight: float, flat: float) -> SurfacePoints:
+    keys, sums = rows
     kept = sums[:, 0] >= least_weight
     cell, sums = cell_of(keys[kept]), sums[kept]
     sums[:, 1:4] += sums[:, :1] * (cell * side)

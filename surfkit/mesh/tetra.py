@@ -168,8 +168,8 @@ class SurfaceBracket:
         if longest:
             near = (length <= longest * (self.sizes[ends[:, 0]] + self.sizes[ends[:, 1]])).numpy()
             faces = faces[near[faces].all(1)]
-        vertices, faces = used(vertices.numpy(), faces)
-        return Mesh(vertices.astype(np.float32), faces.astype(np.int32), vertex_colors(subject, vertices))
+        corners, faces = used(vertices.numpy(), faces)
+        return Mesh(corners.astype(np.float32), faces.astype(np.int32), vertex_colors(subject, corners))
 
 
 def triangles(tets: np.ndarray, inside: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

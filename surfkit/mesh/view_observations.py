@@ -20,7 +20,7 @@ from surfkit.mesh.fusion import TILES_PATTERN
 from surfkit.mesh.fusion_image import Which, depth_of
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.trust import Trust
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 from surfkit.scene.camera import Camera
 
 SIGHT_PIXEL_BYTES = 18
@@ -156,7 +156,7 @@ def _drawn(subject: MeshInput, at: int, how: ObservationSettings) -> dict[str, n
         "depth": torch.stack(layers).float().numpy(),
         "weight": torch.stack(weights).half().numpy(),
         "normal": (127 * normal / length).round().to(torch.int8).numpy(),
-        "color": (255 * maps.color.clamp(0, 1)).round().to(torch.uint8).numpy(),
+        "color": (255 * maps.need("color").clamp(0, 1)).round().to(torch.uint8).numpy(),
     }
 
 
@@ -165,7 +165,7 @@ Each = Callable[[ViewObservation], None]
 
 def for_all(sights: ViewObservations, what: str, each: Each, places: np.ndarray | None = None) -> None:
     """Call `each` with every sight, or those that may see some of (N, 3) places, and report progress."""
-    looking = range(len(sights))
+    looking: Sequence[int] = range(len(sights))
     if places is not None:
         ends = (places.min(0), places.max(0)) if len(places) else None
         looking = [at for at in looking if ends and may_see(sights.cameras[at], *ends)]
@@ -178,11 +178,11 @@ def may_see(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
     """Whether a camera may see some of a box with corners (3,)."""
     lens = [camera.fx, camera.fy, camera.cx, camera.cy]
     pose = camera.world_to_camera.flatten().tolist()
-    return module().may_see([*low.tolist(), *high.tolist()], camera.width, camera.height, lens, pose)
+    return kernels().may_see([*low.tolist(), *high.tolist()], camera.width, camera.height, lens, pose)
 
 
 def boxes_of(places: np.ndarray) -> np.ndarray:
     """(K, 6) float32 lowest and highest corner of each `PIECE` of (N, 3) float32 places: what a view does not see of
     these is passed over."""
-    firsts = np.arange(0, len(places), module().PIECE)
+    firsts = np.arange(0, len(places), kernels().PIECE)
     return np.concatenate([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)], 1)

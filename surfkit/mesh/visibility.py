@@ -8,6 +8,7 @@ single points: a depth map also knows what it sees between them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
@@ -35,7 +36,7 @@ from surfkit.mesh.surface_points import SurfacePoints, gather
 from surfkit.mesh.trust import Trust
 from surfkit.mesh.view_observations import ObservationSettings, ViewObservations, boxes_of, for_all, seen
 from surfkit.mesh.vote_points import SHELL_DEPTH, places_of
-from surfkit.raster.native import lacking, module
+from surfkit.raster.native import kernels, lacking, module
 from surfkit.scene.lengths import Length, check_length, to_local
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.up_direction import up_of_views
@@ -173,7 +174,7 @@ class Visibility(Mesher):
         """See `Mesher.needs_prior`."""
         return not self.sky or self.stereo > 0 or self.trust.needs_prior
 
-    def needs_prior_of(self, views: list[View], frame: Frame) -> bool:
+    def needs_prior_of(self, views: Sequence[View], frame: Frame) -> bool:
         """See `Mesher.needs_prior_of`."""
         wanted = self.stereo > 0 or self.trust.needs_prior
         return wanted or (not self.sky and may_show_sky(views, up_of_views(views, frame)))
@@ -268,7 +269,7 @@ class Visibility(Mesher):
             tile: See `tiles`.
             decided: By tiles before; what this one decides is added.
         """
-        native, threads = module(), torch.get_num_threads()
+        native, threads = kernels(), torch.get_num_threads()
         tets = tetrahedralised(points.places, tile.step)
         given = decided.of(tile, tets.corners)
         count = len(tets.corners)
@@ -324,14 +325,14 @@ class Visibility(Mesher):
         """Numbers of the tetrahedra that hold a camera: they are empty."""
         centres = np.stack([camera.centre.numpy() for camera in sights.cameras]).astype(np.float64)
         found, start = np.empty(len(centres), np.int32), np.zeros(len(centres), np.int32)
-        module().locate(tets.points, tets.corners, tets.neighbours, centres, start, found, torch.get_num_threads())
+        kernels().locate(tets.points, tets.corners, tets.neighbours, centres, start, found, torch.get_num_threads())
         return found[found >= 0]
 
 
 def refuse_too_fine(side: float, limit: float, subject: MeshInput) -> None:
     """BadInput if cells of a side cannot be numbered as far as views see; lengths in local units."""
     centres = torch.stack([view.camera.centre for view in subject.views]).abs()
-    farthest, most = float(centres.max()) + limit, (1 << (module().CELL_BITS - 1)) - 1
+    farthest, most = float(centres.max()) + limit, (1 << (kernels().CELL_BITS - 1)) - 1
     if farthest > most * side:
         least, frame = 1.01 * farthest / most, subject.frame
         raise BadInput(

@@ -7,7 +7,7 @@ import torch
 
 from surfkit.mesh.delaunay import Tetrahedra
 from surfkit.mesh.surface_points import SurfacePoints
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels
 
 SHELL_OFFSETS_CELLS = (-0.5, 0.5, 1.0, 1.5, 2.0)
 """Places before and behind a point along its normal that are looked at, cells: tetrahedra behind a surface are large,
@@ -34,7 +34,7 @@ def places_of(
         (N,) int32 tetrahedron of each place, how many places are of the first kind, the first of these of each
         tetrahedron, (N, 3) float32 the places, and (M,) float32 how many cells those of the second kind stand for.
     """
-    native, threads = module(), torch.get_num_threads()
+    native, threads = kernels(), torch.get_num_threads()
     count = len(tets.corners)
     within = np.where(asked, np.clip((2 / side * np.cbrt(volumes)).astype(np.int64), 1, MAX_PLACES_PER_TETRAHEDRON), 0)
     starts = np.cumsum(within) - within

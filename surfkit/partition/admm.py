@@ -51,7 +51,8 @@ class ConsensusState:
 
 def mean_copies(blocks: Sequence[PointCopies], ids: Tensor) -> tuple[Columns, Tensor]:
     """Mean of all copies of (M,) points, zeros where there is none; (M,) how many copies there are."""
-    counts, sums = torch.zeros(len(ids), dtype=torch.int64), {}
+    counts = torch.zeros(len(ids), dtype=torch.int64)
+    sums: Columns = {}
     for block in blocks:
         rows, at = block.of(ids)
         counts[at] += 1
@@ -105,7 +106,8 @@ def columns_after(block: PointCopies, stats: Columns, agreement: ConsensusState,
 
     The sum u is in units of 1 / rho, and changes with it.
     """
-    (rows, at), found = block.of(agreement.ids), {}
+    rows, at = block.of(agreement.ids)
+    found: Columns = {}
     for name, x in block.params.items():
         z, u, rho = torch.zeros_like(x), torch.zeros_like(x), x.new_zeros(len(x))
         z[rows] = agreement.z[name][at]

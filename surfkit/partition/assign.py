@@ -69,7 +69,7 @@ class SSIMDifference(Assign):
             for block in blocks:
                 without = replace(splats, opacities=splats.opacities * (owner != block))
                 rest = sight.rasterizer.render(without, view.camera, sight.near, geometry=False)
-                found.append(1 - ssim(rest.maps.color, whole.maps.color))
+                found.append(1 - ssim(rest.maps.need("color"), whole.maps.need("color")))
             if blocks:
                 difference[at, blocks] = torch.stack(found).cpu()
             emit(Progress("assigning views", at + 1, len(sight.views)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,8 @@ from surfkit.partition.base import Box, Cells, CoarseModel, Ground, Partition
 
 STRIPS_PER_AXIS = 48
 """Strips along each axis between whose borders cuts are sought."""
+Strips = tuple[int, int, int, int]
+"""A box of strips: the first along each axis, and the first behind it."""
 
 
 @dataclass(frozen=True)
@@ -42,24 +45,28 @@ class Balanced(Partition):
         boxes = self._cut(load, (0, 0, *load.counts.shape), self.count)
         return Cells(ground, tuple(load.box(strips) for strips in boxes), tuple(range(len(boxes))))
 
-    def _cut(
-        self, load: StripWorkload, strips: tuple[int, int, int, int], count: int
-    ) -> list[tuple[int, int, int, int]]:
+    def _cut(self, load: StripWorkload, strips: Strips, count: int) -> list[Strips]:
         """Cut a box of strips into `count`, where the halves' work is most nearly in the ratio of their counts."""
         if count == 1:
             return [strips]
         left = count // 2
-        best = None
-        for axis in (0, 1):
-            for at in range(strips[axis] + 1, strips[axis + 2]):
-                low, high = list(strips), list(strips)
-                low[axis + 2] = high[axis] = at
-                work = load.work(tuple(low)) / left, load.work(tuple(high)) / (count - left)
-                if best is None or max(work) < best[0]:
-                    best = (max(work), tuple(low), tuple(high))
+        best: tuple[float, Strips, Strips] | None = None
+        for low, high in _halves(strips):
+            work = load.work(low) / left, load.work(high) / (count - left)
+            if best is None or max(work) < best[0]:
+                best = max(work), low, high
         if best is None:
             raise BadInput(f"partition: the scene is too narrow for {self.count} blocks; lower balanced.count")
         return [*self._cut(load, best[1], left), *self._cut(load, best[2], count - left)]
+
+
+def _halves(strips: Strips) -> Iterator[tuple[Strips, Strips]]:
+    """Both sides of every cut of a box of strips, along the first axis and then along the second."""
+    x0, y0, x1, y1 = strips
+    for at in range(x0 + 1, x1):
+        yield (x0, y0, at, y1), (at, y0, x1, y1)
+    for at in range(y0 + 1, y1):
+        yield (x0, y0, x1, at), (x0, at, x1, y1)
 
 
 @dataclass(frozen=True)
@@ -97,14 +104,14 @@ class StripWorkload:
             emit(Progress("looking at what views show", at + 1, len(sight.views)))
         return cls(borders, counts, shares, sight.pixels, threshold)
 
-    def work(self, strips: tuple[int, int, int, int]) -> float:
+    def work(self, strips: Strips) -> float:
         """Pixels of the views that look at a box of strips, times its points."""
         x0, y0, x1, y1 = strips
         s = self.shares
         joins = s[:, x1, y1] - s[:, x0, y1] - s[:, x1, y0] + s[:, x0, y0] > self.threshold
         return float(self.pixels[joins].sum() * self.counts[x0:x1, y0:y1].sum())
 
-    def box(self, strips: tuple[int, int, int, int]) -> Box:
+    def box(self, strips: Strips) -> Box:
         """The sides of a box of strips; the outer ones have no end."""
         x0, y0, x1, y1 = strips
         (bx, by), (wide, high) = self.borders, self.counts.shape

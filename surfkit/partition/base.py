@@ -148,12 +148,15 @@ class Cells:
 
         A place is found among the borders of each axis: with as many steps as a cell has there, however many cells.
         """
-        borders = [sorted({box[side] for box in self.boxes for side in (axis, axis + 2)} - {None}) for axis in (0, 1)]
-        x, y = ({border: at + 1 for at, border in enumerate(some)} for some in borders)
+        ends = [{end for box in self.boxes for end in (box[axis], box[axis + 2]) if end is not None} for axis in (0, 1)]
+        borders = [sorted(some) for some in ends]
+        rows: list[dict[float | None, int]] = [{end: at + 1 for at, end in enumerate(some)} for some in borders]
+        x, y = rows
         blocks = torch.full((len(x) + 1, len(y) + 1), -1)
         for (x0, y0, x1, y1), block in zip(self.boxes, self.blocks, strict=True):
             blocks[x.get(x0, 0) : x.get(x1), y.get(y0, 0) : y.get(y1)] = block
-        return *(torch.tensor(some, dtype=torch.float64) for some in borders), blocks
+        across, along = (torch.tensor(some, dtype=torch.float64) for some in borders)
+        return across, along, blocks
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from surfkit.partition.base import Cells
+from surfkit.partition.base import Cells, Contraction
 
 FINE_SIDE_PLACES = 4096
 """Places looked at along each side of a cell before they are spread evenly: the contraction bends and stretches it."""
@@ -61,17 +61,17 @@ def _between(cells: Cells, line: np.ndarray, lower: tuple[int, int], step: float
         owner[inside] = of
     kept = (owner >= 0) & (owner != block)
     if cells.contraction is not None:
-        line = _stretched(cells, line)
+        line = _stretched(cells.contraction, line)
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.linspace(0, along[-1], min(MAX_SIDE_PLACES, int(along[-1] / step) + 2))
-    spread = np.stack([np.interp(at, along, line[:, i]) for i in (0, 1)], axis=1)
-    return spread[kept[np.searchsorted(along, at).clip(max=len(line) - 1)]]
+    places = np.linspace(0, along[-1], min(MAX_SIDE_PLACES, int(along[-1] / step) + 2))
+    spread = np.stack([np.interp(places, along, line[:, i]) for i in (0, 1)], axis=1)
+    return spread[kept[np.searchsorted(along, places).clip(max=len(line) - 1)]]
 
 
-def _stretched(cells: Cells, unit: np.ndarray) -> np.ndarray:
-    """(n, 2) places on the ground of places in the unit square of the contraction."""
-    low, high = (np.array(corner) for corner in (cells.contraction.low, cells.contraction.high))
+def _stretched(contraction: Contraction, unit: np.ndarray) -> np.ndarray:
+    """(n, 2) places on the ground of places in the unit square of a contraction."""
+    low, high = (np.array(corner) for corner in (contraction.low, contraction.high))
     at = (unit - 0.5) * 4
     size = np.abs(at).max(1, keepdims=True)
     far = at / size.clip(1e-12) / (2 - size).clip(1e-9)

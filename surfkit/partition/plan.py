@@ -175,7 +175,8 @@ def with_enough(cells: Cells, joins: Tensor, inside: Tensor, fewest: int, poor: 
     joined = sorted(groups.values(), key=min)
     number = {block: at for at, group in enumerate(joined) for block in group}
     cells = replace(cells, blocks=tuple(number[block] for block in cells.blocks))
-    return cells, *(torch.stack([table[:, sorted(g)].any(1) for g in joined], 1) for table in (joins, inside))
+    joins, inside = (torch.stack([table[:, sorted(g)].any(1) for g in joined], 1) for table in (joins, inside))
+    return cells, joins, inside
 
 
 def touching(cells: Cells) -> dict[int, set[int]]:

@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import name_of
+from surfkit.core.registry import Component, name_of
 from surfkit.io.datasets.data import ReadSettings
 from surfkit.runs.folder import Run
 
@@ -26,7 +26,7 @@ def train_command(run: Run) -> str:
 def _words(name: str, value: Any) -> Iterator[str]:
     """The words that set a field of the command line, or one inside of it."""
     name = name.replace("_", "-")
-    if is_dataclass(value):
+    if isinstance(value, Component) and is_dataclass(value):
         yield f"{name}:{name_of(value)}"
         for field in fields(value):
             if (inner := getattr(value, field.name)) != field.default:

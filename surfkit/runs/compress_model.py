@@ -212,7 +212,7 @@ class PsnrDrop:
     def _render(self, model: SplatModel, view: View) -> Tensor:
         with torch.no_grad():
             maps = self.draws.render(model.splats, view.camera, self.near, geometry=False, distortion=False).maps
-        return maps.color.clamp(0, 1).cpu()
+        return maps.need("color").clamp(0, 1).cpu()
 
 
 def fitted(
@@ -242,6 +242,7 @@ def fitted(
         emit(Progress("choosing settings", done[0], MAX_TRIES + 2))
         if target.bytes is not None:
             return size <= target.bytes
+        assert judge is not None and target.decibels is not None, "a target is one of the two"
         return judge.loss(ModelFile(path).read()[0]) <= target.decibels
 
     done = [0]

@@ -13,6 +13,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
+from surfkit.depth.base import DepthEstimator
 from surfkit.depth.depth_map_cache import key_of, maps
 from surfkit.depth.prepare_depth_maps import REMEDY, WITHOUT_DEPTH, DepthPreparation, others_warning
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DepthFile
@@ -66,8 +67,8 @@ def with_maps(
         yield run
     else:
         with ExitStack() as use:
-            folder = use.enter_context(made_maps(run, scene, prints, caches, device))
-            if begun and folder is not None and folder.name != before.name:
+            folder = use.enter_context(made_maps(run, run.recipe.depth, scene, prints, caches, device))
+            if begun and folder is not None and before is not None and folder.name != before.name:
                 emit(Warned("what depth maps are made from, or how, has changed: the steps to come look at other maps"))
             yield run if folder is None else with_priors(run, folder)
 
@@ -97,16 +98,16 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
         )
     else:
         prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)
-        with made_maps(own, scene, prints, caches, device) as folder:
+        with made_maps(own, run.recipe.depth, scene, prints, caches, device) as folder:
             yield own if folder is None else with_priors(own, folder)
 
 
 @contextmanager
 def made_maps(
-    run: Run, scene: Scene, prints: Fingerprint, caches: CacheSettings, device: Device
+    run: Run, estimator: DepthEstimator, scene: Scene, prints: Fingerprint, caches: CacheSettings, device: Device
 ) -> Iterator[Path | None]:
     """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any."""
-    preparation = DepthPreparation(run.data, run.recipe.depth, torch_device(device))
+    preparation = DepthPreparation(run.data, estimator, torch_device(device))
     tracks = observations(run.data, scene)
     try:
         preparation.refuse_unfit(scene, tracks)
@@ -114,14 +115,14 @@ def made_maps(
         emit(Warned(f"depth maps cannot be made: {error}"))
         yield None
         return
-    if notice := run.recipe.depth.notice():
+    if notice := estimator.notice():
         emit(Warned(notice))
     if (folder := run.data.path / DEPTH_FOLDER).is_dir():
         emit(Warned(f"{folder} has no map of these photographs, so others are made"))
-    key = key_of(run.recipe.depth, scene, prints, tracks, preparation.device)
+    key = key_of(estimator, scene, prints, tracks, preparation.device)
     with maps(preparation, scene, tracks, key, caches.maps_bytes()) as (folder, made):
         count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
-        how = f"made with {name_of(run.recipe.depth)} in {made.cpu_seconds:.0f} s of CPU time"
+        how = f"made with {name_of(estimator)} in {made.cpu_seconds:.0f} s of CPU time"
         emit(Warned(f"depth maps of {count} photographs, {how}, are in {folder}"))
         if made.without:
             emit(Warned(f"the others give no depth: they cannot be read, {WITHOUT_DEPTH}"))

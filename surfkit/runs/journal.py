@@ -21,7 +21,7 @@ from surfkit.core.registry import plugins
 JOURNAL_FILE = "events.jsonl"
 STEP_EVENTS = {"StepDone", "PointsEdited", "Measured"}
 """Events that have the index of their step."""
-REQUIRED_FIELDS = {"event": str, "time": (int, float)}
+REQUIRED_FIELDS: dict[str, type | tuple[type, ...]] = {"event": str, "time": (int, float)}
 """What every line has."""
 
 

@@ -202,13 +202,15 @@ def measure_levels(tree: LodTree, scene: Scene, rasterizer: Rasterizer, pixels: 
     def drawing(splats_of_view: Callable[[View], Splats]) -> Draw:
         return lambda view: draws.render(splats_of_view(view), view.camera, model.near, False, False).maps
 
+    def always(splats: Splats) -> Callable[[View], Splats]:
+        return lambda view: splats
+
     def measured(points: float, draw: Draw) -> dict[str, Any]:
         return {"points": round(points), "bytes": round(points * row_bytes), **_measure(scene, draw)}
 
     rows = []
     for level in tree.levels:
-        splats = level.splats.detached()
-        rows.append(measured(len(level), drawing(lambda view, splats=splats: splats)))
+        rows.append(measured(len(level), drawing(always(level.splats.detached()))))
     views = scene.held_out or scene.train
     counts = [len(tree.seen(view.camera, pixels)) for view in views]
     selected = measured(float(np.mean(counts)), drawing(lambda view: tree.seen(view.camera, pixels)))

@@ -374,7 +374,7 @@ def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> dict[str, str]:
         emit(FileWritten(path, f"picture, {told[path.name]}"))
     for at, view in enumerate(views):
         camera = view.camera.fitted(PICTURE_SIDE_PX)
-        color = subject.draw(view).color.clamp(0, 1)
+        color = subject.draw(view).need("color").clamp(0, 1)
         if camera != view.camera:
             size = (camera.height, camera.width)
             color = torch.nn.functional.interpolate(color[None], size, mode="area")[0]

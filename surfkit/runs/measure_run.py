@@ -11,7 +11,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.images.comparison_pictures import panel, picture_path, write_picture
 from surfkit.evaluate.images.lpips import networks
-from surfkit.evaluate.images.measure_images import evaluate_views, frames_per_second
+from surfkit.evaluate.images.measure_images import Draw, evaluate_views, frames_per_second
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.raster.api import Maps
 from surfkit.runs.compress_model import decompressed
@@ -103,11 +103,12 @@ def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
     """
     if not scene.held_out:
         return
+    assert made.splats is not None, "a refinement begins with splats"
     ahead = PHOTOS_AHEAD * max(3 * view.camera.width * view.camera.height for view in scene.held_out)
     found = evaluate_views(
         scene.held_out,
         photo_cache(scene.held_out, ahead),
-        made.draw_color,
+        drawing_colors(made),
         correct_color=made.correct_color,
         masks=mask_cache(scene.held_out, ahead),
     )["images"]
@@ -116,6 +117,13 @@ def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
         {name: value for name, value in found.items() if name != "per_image"} | {"points": len(made.splats)},
     )
     emit(FileWritten(stage.before, "measurements before the refinement"))
+
+
+def drawing_colors(made: Reconstruction) -> Draw:
+    """What draws the colours of a reconstruction that is drawn, without more than it must."""
+    draw = made.draw_color or made.draw
+    assert draw is not None, "splats are drawn"
+    return draw
 
 
 def measured_before(run: Run) -> dict[str, Any]:
@@ -132,7 +140,7 @@ def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str
     run, (inner, small) = ctx.run, decompressed(ctx, made)
     found = evaluate(inner.run, small, ctx.scene, lpips_weights=lpips_weights)
     views = ctx.scene.held_out or ctx.scene.train
-    both = [frames_per_second(views, each.draw_color or each.draw) for each in (made, small)]
+    both = [frames_per_second(views, drawing_colors(each)) for each in (made, small)]
     note_metrics(inner.run.metrics, {"fps_before_and_after": both})  # within a minute, on the same machine
     return note_compressed(run, found | {"fps_before_and_after": both})
 

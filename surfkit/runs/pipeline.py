@@ -179,6 +179,7 @@ class RecipeStages:
         if run.recipe.partition is not None:
             state = None  # it is in the folder
             state = tune_blocks(ctx, self.compute, self.optimise_partition)
+        assert state is not None, "a first stage that needs no start is finished"
         return optimised(run, refine_model(ctx, state))
 
     def optimise_partition(self, run: Run) -> None:
@@ -251,7 +252,7 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Memory
         again = f"; `{run.to_paste('evaluate')}` measures it again" if made.draw is not None else ""
         say(f"{run.out} is finished, and nothing is left to do{again}")
         return read_metrics(run.out)
-    if not has_cloud(run, made):
+    if made.splats is not None and not has_cloud(run, made):
         export(run, made.splats, scene)
     if not meshed:
         mesh(ctx, made, device)
@@ -298,6 +299,7 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
             what = mesh_input(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
             make_mesh(ctx.run, made.mesh, MeshOutput(), what, made.last_steps)
             return
+        assert mesher is not None, "a run without a mesh of its own comes here if its recipe wants one"
         with with_maps_to_mesh(ctx.run, mesher, ctx.scene, ctx.caches, device) as run:
             what = mesh_input(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
             make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
@@ -376,6 +378,7 @@ def load_run(out: Path, read_data: Callable[[Run], Scene] = read_unchanged) -> t
     if missing is not None:
         what = "not all blocks are tuned" if missing.name == "tune" else f"{missing.name} is not begun"
         raise BadInput(f"{out}: {what}; {again}")
+    assert state is not None, "a stage without a state is missing"
     return run, state, scene
 
 

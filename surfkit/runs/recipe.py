@@ -17,6 +17,7 @@ from surfkit.core.registry import choice, components, name_of
 from surfkit.core.schedule import rescale
 from surfkit.depth.base import DepthEstimator
 from surfkit.io.datasets.data import TEST_EVERY
+from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.consensus import Consensus
 from surfkit.mesh.base import Mesher
 from surfkit.partition.assign import Assign, SSIMDifference
@@ -185,7 +186,7 @@ class Recipe:
 
 def _refuse_weights(path: str, stage: Stage) -> None:
     """BadInput for a weight that is not finite or below 0, with which a term would be left out without a word."""
-    terms = {f"losses.{key}": loss for key, loss in stage.losses.items()}
+    terms: dict[str, Loss | Regularizer] = {f"losses.{key}": loss for key, loss in stage.losses.items()}
     terms |= {f"regularizers.{key}": term for key, term in stage.regularizers.items()}
     for key, term in terms.items():
         for index in (1, stage.steps):
@@ -249,7 +250,8 @@ def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
         known = {name: column.rate for name, column in primitive.columns().items()}
         return replace(stage, rates=known | stage.rates)
 
-    kind, found = components(Primitive).get(primitive), recipe.primitive
+    kind = None if primitive is None else components(Primitive).get(primitive)
+    found = recipe.primitive
     if kind is not None and kind is not type(found):
         found = kind()
     pretrain, tune = with_rates(recipe.pretrain, found), with_rates(recipe.tune, found)

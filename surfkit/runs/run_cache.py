@@ -153,9 +153,10 @@ def _package(name: str) -> str:
 def _source_tag(name: str) -> str:
     """What tells the code of an installed plugin from other code of the same version; "" for parts of surfkit."""
     module = inspect.getmodule(plugins().get_plugin(name))
-    if name in BUILTIN or module is None or not getattr(module, "__file__", None):
+    source: str | None = getattr(module, "__file__", None)
+    if name in BUILTIN or module is None or not source:
         return ""
-    file = Path(module.__file__)
+    file = Path(source)
     is_alone = not getattr(module, "__package__", None)
     paths = [file] if is_alone else sorted(each for each in file.parent.rglob("*") if each.suffix in CODE_SUFFIXES)
     found = hashlib.sha256()

@@ -158,7 +158,7 @@ def reconstruct(run: Run, given: MethodInput) -> Reconstruction:
     with clocked(result_path(run).with_name("cost.json")) as cost, steps_shown(name_of(method)):
         made = method.reconstruct(given)
     seconds, cpu_seconds = cost()
-    measured = {
+    measured: dict[str, Any] = {
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "peak_memory_bytes": peak_memory_bytes(),
@@ -219,9 +219,10 @@ def keep(run: Run, made: Reconstruction) -> None:
     folder.mkdir(exist_ok=True)
     if made.mesh is not None:
         refuse_unsound(made.mesh, name)
-        more = {} if made.mesh.colors is None else {"colors": made.mesh.colors}
+        more: dict[str, Any] = dict(made.mesh.values)
+        more |= {} if made.mesh.colors is None else {"colors": made.mesh.colors}
         with replacing(folder / "mesh.npz") as file:
-            np.savez(file, vertices=made.mesh.vertices, faces=made.mesh.faces, **more, **made.mesh.values)
+            np.savez(file, vertices=made.mesh.vertices, faces=made.mesh.faces, **more)
     if made.splats is not None:
         params = {key: value.detach().cpu().contiguous() for key, value in made.splats.params.items()}
         with replacing(folder / "splats.safetensors") as file:
@@ -276,11 +277,12 @@ def with_drawing(made: Reconstruction, rasterizer: Rasterizer) -> Reconstruction
     """The reconstruction with its splats drawn by the rasterizer, where it does not draw by itself."""
     if made.draw is not None or made.splats is None:
         return made
-    near, draws = made.splats.near, drawn_by(made.splats.primitive, rasterizer)
+    model = made.splats
+    near, draws = model.near, drawn_by(model.primitive, rasterizer)
 
     @cache
     def there() -> Splats:
-        return made.splats.splats.to(rasterizer.where())
+        return model.splats.to(rasterizer.where())
 
     def maps(splats: Splats, view: View, geometry: bool = True) -> Maps:
         return draws.render(splats, view.camera, near, geometry, distortion=False).maps

@@ -73,7 +73,8 @@ class RunNotes:
 
 def higher(known: Mapping[str, int], found: Mapping[str, int]) -> dict[str, int]:
     """The report with the higher peak; of equal peaks, the later one unless it has fewer parts."""
-    return dict(max((found, known), key=lambda parts: (parts.get("peak", 0), len(parts))))
+    best: Mapping[str, int] = max((found, known), key=lambda parts: (parts.get("peak", 0), len(parts)))
+    return dict(best)
 
 
 @contextmanager

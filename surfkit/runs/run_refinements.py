@@ -26,6 +26,7 @@ from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel
 from surfkit.train.data_cache import TrainingData, read_ahead
 from surfkit.train.memory_meter import MemoryMeter
+from surfkit.train.refine.base import Refine
 from surfkit.train.state import StageState
 
 DRAWN_AHEAD = 2
@@ -41,14 +42,14 @@ def refine_model(ctx: RunContext, state: StageState) -> StageState:
     """
     for before, stage in itertools.pairwise(ctx.run.stages):
         if stage.refine is not None:
-            state = _refine_once(ctx, before, state, stage)
+            state = _refine_once(ctx, before, state, stage, stage.refine)
             ctx.keep(stage.name)
     return state
 
 
-def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage) -> StageState:
+def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage, refine: Refine) -> StageState:
     """The state after one refinement, from the state of the stage before it."""
-    run, refine, scene = ctx.run, stage.refine, stage_scene(ctx.run, stage, ctx.scene)
+    run, scene = ctx.run, stage_scene(ctx.run, stage, ctx.scene)
     state = load_state(run, stage, scene, repair=True)
     if state is not None and state.index >= stage.stage.steps:
         return state
@@ -61,6 +62,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     def start(_: torch.Generator) -> InitialModel:
         found = made()
+        assert found.splats is not None
 
         def to_mesh(mesher: Mesher) -> MeshInput:
             return mesh_input(run, found, scene, ctx.rasterizer, cache_bytes("auto"), mesher)
@@ -89,7 +91,7 @@ def _rendered_data(before: RunStage, given: StageState, scene: Scene, rasterizer
     draw = drawing(before, given, rasterizer, geometry=False)
 
     def picture(at: int) -> Tensor:
-        return (draw(scene.train[at]).color.clamp(0, 1) * 255).round().to("cpu", dtype=torch.uint8)
+        return (draw(scene.train[at]).need("color").clamp(0, 1) * 255).round().to("cpu", dtype=torch.uint8)
 
     sizes = [3 * view.camera.width * view.camera.height for view in scene.train]
     return TrainingData(Cache(picture, sizes, DRAWN_AHEAD * max(sizes), threads=1))

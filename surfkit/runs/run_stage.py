@@ -13,7 +13,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
-from surfkit.core.memory import is_out_of_gpu_memory, peak_memory_bytes
+from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory, peak_memory_bytes
 from surfkit.evaluate.images.measure_images import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
@@ -27,7 +27,7 @@ from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import TrainingData
-from surfkit.train.faults import MAX_RATE_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
+from surfkit.train.faults import MAX_RATE_HALVINGS, Diverged, NotFinite, out_of_memory
 from surfkit.train.in_view import with_frozen
 from surfkit.train.interrupt import graceful
 from surfkit.train.memory_meter import MemoryMeter
@@ -213,7 +213,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
             meter.step(state, job.given, trainer.uploads)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < MIN_FREE_MEMORY_BYTES:
                 lower_caches(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
-            if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
+            if along is not None and intervals.pictures and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
                     along.look(done.index, drawing(at, state, trainer.rasterizer))
             is_over = request.asked or done.index == job.until

@@ -158,7 +158,7 @@ def ground_of(found: Votes) -> np.ndarray:
     """(X, Y) number of the lowest voxel above the ground: the lowest surface around that many views see."""
     from scipy.ndimage import gaussian_filter, minimum_filter, zoom
 
-    lowest = np.full(found.surfaces.shape[:2], NOWHERE)
+    lowest: np.ndarray = np.full(found.surfaces.shape[:2], NOWHERE)
     for i, (surfaces, through) in enumerate(zip(found.surfaces, found.through, strict=True)):
         sure = (surfaces >= MIN_GROUND_VIEWS) & (surfaces > through)
         lowest[i] = np.where(sure.any(1), sure.argmax(1), NOWHERE)

@@ -88,9 +88,9 @@ def _decibels(table: SplatTable, scene: Scene) -> dict[Axes, float]:
         local, primitive = in_scene(from_axes(plain, name), scene.frame), primitive_of(plain)
         model = SplatModel(primitive, primitive.from_table(local, torch.Generator()))
         draws, total = drawn_by(primitive, rasterizer), 0.0
-        for view, photo in photos:
+        for view, target in photos:
             maps = draws.render(model.splats, view.camera, model.near, geometry=False, distortion=False).maps
-            total += psnr(maps.color, photo)
+            total += psnr(maps.need("color"), target)
         found[name] = total / max(len(photos), 1)
     return found
 

@@ -96,8 +96,9 @@ def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
     for at, prior in enumerate(known.priors or ()):
         if prior is not None:
             there = (prior.inverse > 0) & (prior.confidence >= MIN_SEEING_CONFIDENCE)
-            if known.masks is not None and known.masks[at] is not None:
-                there &= known.masks[at]
+            mask = None if known.masks is None else known.masks[at]
+            if mask is not None:
+                there &= mask
             camera, (height, width) = known.scene.train[at].camera, prior.inverse.shape
             yield camera.resized(width, height), torch.where(there, 1 / prior.inverse.clamp_min(1e-20), 0.0)
         emit(Progress("seeing through space", at + 1, len(known.priors or ())))

@@ -143,7 +143,8 @@ class VoxelAccumulator:
     def __init__(self, side: float, most: int) -> None:
         """Empty; `side`: of the smallest voxels; `most`: how many are kept."""
         self.voxels = Voxels(side, np.zeros(0, np.int64), np.zeros((0, 10), np.float32))
-        self.most, self.waiting = most, []
+        self.most = most
+        self.waiting: list[Voxels] = []
 
     @classmethod
     def for_points(cls, side: float, points: int) -> VoxelAccumulator:

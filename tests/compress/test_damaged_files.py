@@ -322,6 +322,7 @@ def test_streams_come_back():
         "länge": np.ones((1, 1), np.uint8),
     }
     found = unpacked(packed(streams), 200_000)
+    assert packed(found) == packed(streams)  # what is not decoded yet is packed as what is
     assert list(found) == list(streams)
     for name, numbers in streams.items():
         assert np.array_equal(found[name].numbers(), numbers) and found[name].dtype == numbers.dtype

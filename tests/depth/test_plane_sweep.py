@@ -181,9 +181,9 @@ def test_maps_agree_as_in_torch(farm):
     maps[1] = torch.nn.functional.interpolate(maps[1][None, None], (41, 57), mode="nearest-exact")[0, 0]
     others = list(zip(cameras[1:], maps[1:], strict=True))
     native, plain = (how(cameras[0], maps[0], others, 0.01) for how in (agreement, agreement_in_torch))
-    assert native.count.max() >= 3 and native.count.dtype == plain.count.dtype
+    assert native.agreeing.max() >= 3 and native.agreeing.dtype == plain.agreeing.dtype
     # Positions are rounded differently, and so may fall on the pixel beside.
-    same = (native.count == plain.count) & (native.shown == plain.shown)
+    same = (native.agreeing == plain.agreeing) & (native.shown == plain.shown)
     assert same.float().mean() > 0.999
     torch.testing.assert_close(native.fused[same], plain.fused[same], rtol=1e-5, atol=0)
     alone = agreement(cameras[0], maps[0], [], 0.01)

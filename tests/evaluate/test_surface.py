@@ -295,3 +295,10 @@ def test_the_highest_points_of_a_cloud_are_a_surface():
 )
 def test_systems_are_compared_in_plan(one, other, same):
     assert same_plan(one, other) is same
+
+
+def test_a_cloud_has_no_triangles():
+    faces = np.array([[0, 1, 2]])
+    assert SurfaceFile(Path("box.ply"), np.eye(3), faces).triangles is faces
+    with pytest.raises(ValueError, match="box.ply: a cloud of points"):
+        _ = SurfaceFile(Path("box.ply"), np.eye(3)).triangles

@@ -160,9 +160,9 @@ def merged_model(model: SplatModel, labels: np.ndarray, weights: np.ndarray) -> 
         else:
             each = columns[name].activation.value(raw.detach()).double().cpu().numpy().reshape(len(raw), -1)
             value = summed(each * weights[:, None], labels) / total[:, None]
-        value = torch.from_numpy(np.ascontiguousarray(value)).view(len(total), *raw.shape[1:])
+        activated = torch.from_numpy(np.ascontiguousarray(value)).view(len(total), *raw.shape[1:])
         with one_thread():
-            params[name] = columns[name].activation.inverse(value).to(raw)
+            params[name] = columns[name].activation.inverse(activated).to(raw)
     return replace(model, params=params)
 
 

@@ -94,9 +94,8 @@ def renders(given: LodInput, views: Sequence[View]) -> Cache[Tensor]:
     draws, splats = drawn_by(model.primitive, given.rasterizer), model.splats.detached()
 
     def picture(at: int) -> Tensor:
-        drawn = draws.render(
-            splats, given.views[at % len(given.views)].camera, model.near, False, False
-        ).maps.color.clamp(0, 1)
+        camera = given.views[at % len(given.views)].camera
+        drawn = draws.render(splats, camera, model.near, False, False).maps.need("color").clamp(0, 1)
         size = (views[at].camera.height, views[at].camera.width)
         small = drawn if drawn.shape[1:] == size else interpolate(drawn[None], size, mode="area")[0]
         return (small * 255).round().to("cpu", dtype=torch.uint8)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, gains, pattern, way
-from surfkit.raster.native import module
+from surfkit.raster import native
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
 from surfkit.scene.camera import Camera
@@ -89,7 +89,7 @@ class GpuPasses:
         pictures = [self.picture(other) for other in others]
         nothing = torch.empty(0, 0, device=self.device)
         maps = [nothing if found is None else found.to(self.device) for found in known or [None] * len(others)]
-        views = self.uploads(np.frombuffer(views_of(here, others, planes, pictures, maps), np.uint8))
+        views = self.uploads(np.frombuffer(bytes(views_of(here, others, planes, pictures, maps)), np.uint8))
         given = self.picture(here), joined(pictures), joined(maps)
         state = [self.uploads(part) for part in (planes.value, planes.cost, planes.each)]
         height, width = planes.cost.shape
@@ -117,7 +117,7 @@ def in_fours(value: np.ndarray) -> np.ndarray:
     Continued by a border of b pixels. A GPU reads four bytes at once only where they are aligned, unlike a CPU
     (`GreyImage.in_pairs`).
     """
-    border = module().STEREO_BORDER
+    border = native.kernels().STEREO_BORDER
     wide = np.pad(value, (border, border + 1), mode="edge").astype(np.uint32)
     return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
 
@@ -129,9 +129,9 @@ def joined(parts: Sequence[Tensor]) -> Tensor:
 
 def views_of(
     here: GreyImage, others: Sequence[GreyImage], planes: Planes, pictures: Sequence[Tensor], maps: Sequence[Tensor]
-) -> ctypes.Array:
+) -> ctypes.Array[PatchMatchView]:
     """A `PatchMatchView` for each picture to compare with, of those that are joined."""
-    border = module().STEREO_BORDER
+    border = native.kernels().STEREO_BORDER
     made = (PatchMatchView * len(others))()
     first = first_inverse = 0
     bright = gains(here, others, planes)
@@ -159,6 +159,6 @@ def job_of(camera: Camera, views: int, terms: MatchingSettings, seed: int) -> Pa
         seed % 2**32,
         (camera.fx, camera.fy, camera.cx, camera.cy),
         numbers,
-        (module().STEREO_BORDER - 2) / most,
+        (native.kernels().STEREO_BORDER - 2) / most,
         tuple(offsets.flatten().tolist()),
     )

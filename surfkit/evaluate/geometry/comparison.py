@@ -222,7 +222,7 @@ def compare(
         measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
         if number == 0:
             measure.refuse_other_frame(matrix)
-        found = {}
+        found: dict[str, RepetitionResult | None] = {}
         for way in (settings.align,) if number else ALIGNMENTS:
             found[way] = measure.draw(matrix, way)
             done += 1
@@ -232,7 +232,7 @@ def compare(
     warn_of_loss(draws[0], others["none"], settings.align, tau)
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
-    outside = crop and outside_shares(reconstruction, draws[0].alignment.matrix, crop)
+    outside = None if crop is None else outside_shares(reconstruction, draws[0].alignment.matrix, crop)
     return ComparisonResult(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside)
 
 
@@ -264,8 +264,10 @@ def truth_side(truth: SurfaceFile, settings: Comparison) -> tuple[ComparedSurfac
     found = cloud_side(truth, settings.voxel)
     if settings.tau is not None:
         return found, settings.tau
-    refuse_few(found.cloud, truth.path)
-    tau = AUTO_TAU * spacing(tree(found.cloud), found.cloud[:: max(1, len(found.cloud) // 1_000_000)])
+    cloud = found.cloud
+    assert cloud is not None, "what is no mesh is read as a cloud"
+    refuse_few(cloud, truth.path)
+    tau = AUTO_TAU * spacing(tree(cloud), cloud[:: max(1, len(cloud) // 1_000_000)])
     if not tau > 0:
         raise BadInput(
             f"{truth.path}: the distance between its neighbouring points is 0, which gives no threshold; give --tau"

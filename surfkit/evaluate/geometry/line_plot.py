@@ -41,7 +41,7 @@ def write_lines(
     title: str,
     x_label: str,
     top: float | None = None,
-    mark: tuple[str, float] = (),
+    mark: tuple[str, float] | None = None,
 ) -> None:
     """Save a chart of lines as PNG; both axes begin with 0.
 
@@ -64,7 +64,7 @@ def write_lines(
         drawn = [axes.plot(line.x, line.y, color=line.color, linewidth=line.width)[0] for line in lines]
         axes.set_xlim(0, max(float(line.x.max()) for line in lines) or 1)
         axes.set_ylim(0, top or 1.05 * max(float(line.y.max()) for line in lines) or 1)
-        if mark:
+        if mark is not None:
             axes.axvline(mark[1], color="0.2", linewidth=1)
             axes.annotate(mark[0], (mark[1], 0), xytext=(4, 4), textcoords="offset points")
         for axis in (axes.xaxis, axes.yaxis):

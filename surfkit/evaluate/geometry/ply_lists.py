@@ -68,7 +68,9 @@ def fans(path: Path, triangle: np.dtype, start: int, count: int) -> np.ndarray:
     Raises:
         BadInput: Cut off, or a face with fewer than three corners.
     """
-    (wide, at_size), (three, at_corners) = triangle.fields["size"], triangle.fields["corners"]
+    fields, wide, three = triangle.fields, triangle["size"], triangle["corners"]
+    assert fields is not None, "a face has named fields"
+    at_size, at_corners = fields["size"][1], fields["corners"][1]
     each, corner = three.itemsize // 3, three.base
     data, at, rows, sizes = path.read_bytes(), start, np.empty(count, np.int64), np.empty(count, np.int64)
     for face in range(count):

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from surfkit.evaluate.geometry.scores import WORKERS, tree
 from surfkit.evaluate.geometry.transform import apply, fitted, scale_of
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 ICP_ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
 """Voxel and reach of each round, multiples of tau (the Tanks and Temples toolbox, whose last round thins by count)."""
@@ -47,7 +51,7 @@ class IcpResult:
         return scale_of(self.matrix)
 
 
-Clouds = Callable[[float, np.ndarray], tuple[np.ndarray, object, np.ndarray]]
+Clouds = Callable[[float, np.ndarray], tuple[np.ndarray, "cKDTree", np.ndarray]]
 """For a voxel and the transform so far: (n, 3) points of the reconstruction in its own frame, and the truth as a search
 tree and as the (m, 3) points of it, each thinned and inside the crop volume."""
 
@@ -74,7 +78,7 @@ def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool, mutua
 
 def icp(
     source: np.ndarray,
-    there: object,
+    there: cKDTree,
     target: np.ndarray,
     start: IcpResult,
     reach: float,
@@ -101,10 +105,9 @@ def icp(
             near[near] = _answered(source[near], here, source, target[partner[near]], found.matrix, slack)
         residual = float(np.sqrt((away[near] ** 2).mean())) if near.any() else None
         now = IcpResult(found.matrix, float(near.mean()), residual)
-        settled = found.residual is not None and residual is not None
-        settled = settled and abs(now.matched - found.matched) < MIN_CHANGE
-        if settled and abs(residual - found.residual) < MIN_CHANGE * max(residual, found.residual):
-            return now
+        if found.residual is not None and residual is not None and abs(now.matched - found.matched) < MIN_CHANGE:
+            if abs(residual - found.residual) < MIN_CHANGE * max(residual, found.residual):
+                return now
         if near.sum() < 3 or residual == 0:
             return now
         matrix = fitted(source[near], target[partner[near]], with_scale)
@@ -117,7 +120,7 @@ def icp(
 
 
 def _answered(
-    points: np.ndarray, here: object, source: np.ndarray, partners: np.ndarray, matrix: np.ndarray, slack: float
+    points: np.ndarray, here: cKDTree, source: np.ndarray, partners: np.ndarray, matrix: np.ndarray, slack: float
 ) -> np.ndarray:
     """(n,) bool: whether the partners of (n, 3) points find these, or points of the source near them."""
     _, back = here.query(apply(np.linalg.inv(matrix), partners), workers=WORKERS)

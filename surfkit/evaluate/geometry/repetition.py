@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
 from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.crop import Crop
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 MAX_COMPARED_POINTS = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
@@ -107,12 +111,12 @@ def mesh_side(surface: SurfaceFile, count: int | None, tau: float, box: Box | No
     """
     sparse = None
     if count is None:
-        area, least = float(face_areas(surface).sum()), len(surface) + len(surface.faces)
+        area, least = float(face_areas(surface).sum()), len(surface) + len(surface.triangles)
         needed = _needed(area, tau)
         if (
             needed > max(least, MAX_COMPARED_POINTS)
             and box is not None
-            and len((part := part_within(surface, *box)).faces)
+            and len((part := part_within(surface, *box)).triangles)
         ):
             inner = float(face_areas(part).sum())
             surface, needed, least = part, _needed(inner, tau), max(MIN_COMPARED_POINTS, int(least * inner / area))
@@ -173,11 +177,11 @@ class Measurement:
         """(m, 3) of (n, 3) points in the frame of the truth."""
         return thin([points], voxel, self.target[0] - self.offset * voxel)
 
-    def _target(self, voxel: float) -> tuple[object, np.ndarray]:
+    def _target(self, voxel: float) -> tuple[cKDTree, np.ndarray]:
         points = self.thinned(self.target, voxel)
         return tree(points), points
 
-    def clouds(self, voxel: float, matrix: np.ndarray) -> tuple[np.ndarray, object, np.ndarray]:
+    def clouds(self, voxel: float, matrix: np.ndarray) -> tuple[np.ndarray, cKDTree, np.ndarray]:
         """What a round of ICP compares (`registration.Clouds`)."""
         few = self.source[:: max(1, len(self.source) // MAX_ICP_POINTS)]
         moved = self.thinned(self.cropped(apply(matrix, few)), voxel)

@@ -39,7 +39,7 @@ def sample_faces(mesh: SurfaceFile, count: int, draw: np.random.Generator) -> tu
         part = slice(start, start + BLOCK_POINTS)
         spot = (shift[part] + order[part, None] * R2_STEPS) % 1
         spot = np.where(spot.sum(1, keepdims=True) > 1, 1 - spot, spot)
-        corners = mesh.vertices(mesh.faces[face[part]].ravel()).reshape(-1, 3, 3)
+        corners = mesh.vertices(mesh.triangles[face[part]].ravel()).reshape(-1, 3, 3)
         sides = corners[:, 1:] - corners[:, :1]
         points[part] = corners[:, 0] + (spot[:, :, None] * sides).sum(1)
     return points, face
@@ -47,9 +47,9 @@ def sample_faces(mesh: SurfaceFile, count: int, draw: np.random.Generator) -> tu
 
 def face_areas(mesh: SurfaceFile) -> np.ndarray:
     """(F,) areas of the triangles of a mesh, float64."""
-    areas = np.empty(len(mesh.faces))
+    areas = np.empty(len(mesh.triangles))
     for start in range(0, len(areas), BLOCK_POINTS):
-        corners = mesh.vertices(np.asarray(mesh.faces[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
+        corners = mesh.vertices(np.asarray(mesh.triangles[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas[start : start + BLOCK_POINTS] = np.linalg.norm(normals, axis=1) / 2
     return areas

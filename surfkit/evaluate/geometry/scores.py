@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 WORKERS = 2
 """Threads that look for neighbours."""
@@ -25,14 +29,14 @@ class Distances:
     to_reconstruction: np.ndarray
 
 
-def tree(points: np.ndarray) -> object:
+def tree(points: np.ndarray) -> cKDTree:
     """A search tree (scipy's cKDTree) of (n, 3) points."""
     from scipy.spatial import cKDTree
 
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
-def nearest(there: object, points: np.ndarray) -> np.ndarray:
+def nearest(there: cKDTree, points: np.ndarray) -> np.ndarray:
     """(n,) float64 distances of (n, 3) points to the nearest point of a tree."""
     parts = [
         there.query(points[start : start + BLOCK_POINTS], workers=WORKERS)[0]
@@ -41,7 +45,7 @@ def nearest(there: object, points: np.ndarray) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
-def nearest_rows(there: object, points: np.ndarray) -> np.ndarray:
+def nearest_rows(there: cKDTree, points: np.ndarray) -> np.ndarray:
     """(n,) rows, in the tree, of the point nearest to each of (n, 3) points."""
     parts = [
         there.query(points[start : start + BLOCK_POINTS], workers=WORKERS)[1]
@@ -50,12 +54,12 @@ def nearest_rows(there: object, points: np.ndarray) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0, np.int64)
 
 
-def spacing(there: object, points: np.ndarray) -> float:
+def spacing(there: cKDTree, points: np.ndarray) -> float:
     """Mean distance of points to their nearest neighbour other than themselves, in the tree of all of them."""
     return float(there.query(points, k=2, workers=WORKERS)[0][:, 1].mean())
 
 
-def surface_gap(there: object, points: np.ndarray) -> float:
+def surface_gap(there: cKDTree, points: np.ndarray) -> float:
     """1 / sqrt(points per area) of a surface that points were drawn from in any way, by the distance to the eighth."""
     eighth = there.query(points, k=[9], workers=WORKERS)[0][:, 0]
     return float(np.sqrt(np.pi / 8) * eighth[np.isfinite(eighth)].mean()) if np.isfinite(eighth).any() else 0.0
@@ -80,12 +84,14 @@ def chamfer(distances: Distances, far: float | None = None) -> dict[str, float |
         distances: Both ways.
         far: Distances above this do not count, as DTU leaves out those above 20 mm.
     """
-    both = []
-    for values in (distances.to_truth, distances.to_reconstruction):
+
+    def mean(values: np.ndarray) -> float | None:
         counted = values if far is None else values[values <= far]
-        both.append(float(counted.mean()) if len(counted) else None)
-    overall = None if None in both else sum(both) / 2
-    return {"accuracy": both[0], "completeness": both[1], "overall": overall}
+        return float(counted.mean()) if len(counted) else None
+
+    accuracy, completeness = mean(distances.to_truth), mean(distances.to_reconstruction)
+    overall = None if accuracy is None or completeness is None else (accuracy + completeness) / 2
+    return {"accuracy": accuracy, "completeness": completeness, "overall": overall}
 
 
 def curve(distances: Distances, taus: np.ndarray) -> np.ndarray:

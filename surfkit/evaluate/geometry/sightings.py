@@ -43,18 +43,18 @@ def sightings(
         frame: Of the views.
         gap: Between points of the truth, input units: 1 / sqrt(points per area).
     """
-    found = tuple(Sightings(*(np.zeros(len(points), np.int32) for _ in range(2))) for points in clouds)
+    truth, others = (Sightings(*(np.zeros(len(points), np.int32) for _ in range(2))) for points in clouds)
     for done, view in enumerate(views, 1):
         camera = view.camera.sized(DEPTH_LONGEST_PX)
         pose = frame.input_pose(camera.world_to_camera)
         depth, spots = cloud_depth(clouds[0], camera, pose, gap)
         near = near_edges(depth, gap)
-        for of, (at, x, y, z) in zip(found, (spots, project(clouds[1], camera, pose)), strict=True):
+        for of, (at, x, y, z) in zip((truth, others), (spots, project(clouds[1], camera, pose)), strict=True):
             seen = not_hidden(depth, (at, x, y, z), gap, camera)
             of.seen[at[seen]] += 1
             of.edges[at[seen & near[y, x]]] += 1
         emit(Progress("counting the views of each class", done, len(views)))
-    return found
+    return truth, others
 
 
 def near_edges(depth: np.ndarray, gap: float) -> np.ndarray:

@@ -48,6 +48,13 @@ class SurfaceFile:
     def __len__(self) -> int:
         return len(self.rows)
 
+    @property
+    def triangles(self) -> np.ndarray:
+        """The faces of a mesh; ValueError for a cloud."""
+        if self.faces is None:
+            raise ValueError(f"{self.path}: a cloud of points, which has no faces; ask for `faces` first")
+        return self.faces
+
     def vertices(self, part: slice | np.ndarray = slice(None)) -> np.ndarray:
         """(n, 3) float64 of all vertices, or of some."""
         if self.rows.dtype.names is None:
@@ -96,8 +103,8 @@ def part_within(mesh: SurfaceFile, low: np.ndarray, high: np.ndarray) -> Surface
         high: (3,) greatest.
     """
     found, piece = [], float(np.linalg.norm(high - low)) / BOX_PIECES
-    for start in range(0, len(mesh.faces), BLOCK_POINTS):
-        corners = mesh.vertices(np.asarray(mesh.faces[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
+    for start in range(0, len(mesh.triangles), BLOCK_POINTS):
+        corners = mesh.vertices(np.asarray(mesh.triangles[start : start + BLOCK_POINTS]).ravel()).reshape(-1, 3, 3)
         while len(corners):
             least, most = corners.min(1), corners.max(1)
             touches = ((least <= high) & (most >= low)).all(1)

@@ -39,7 +39,7 @@ def normals_at(side: ComparedSurface, places: np.ndarray, cloud: np.ndarray, dra
 
 
 def _face_normals(mesh: SurfaceFile, faces: np.ndarray) -> np.ndarray:
-    corners = mesh.vertices(np.asarray(mesh.faces[faces]).ravel()).reshape(-1, 3, 3)
+    corners = mesh.vertices(np.asarray(mesh.triangles[faces]).ravel()).reshape(-1, 3, 3)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-300)
 

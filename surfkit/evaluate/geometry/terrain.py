@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def terrain(points: np.ndarray, turn: np.ndarray, tau: float) -> Terrain:
     return Terrain(turn, corner, cell, heights, max(2 * tau, CLEARANCE * highest))
 
 
-def _filled(values: np.ndarray, known: np.ndarray, ndimage: object) -> np.ndarray:
+def _filled(values: np.ndarray, known: np.ndarray, ndimage: ModuleType) -> np.ndarray:
     """(X, Y) values, that of the nearest known cell where they are not known."""
     if known.all():
         return values

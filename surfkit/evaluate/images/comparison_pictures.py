@@ -68,7 +68,7 @@ def panel(photo: Tensor, maps: Maps) -> Tensor:
         photo: (3, H, W) uint8.
         maps: Of the same view.
     """
-    parts = [photo.cpu().float() / 255, maps.color.detach().cpu().float().clamp(0, 1)]
+    parts = [photo.cpu().float() / 255, maps.need("color").detach().cpu().float().clamp(0, 1)]
     if maps.median is not None:
         parts.append(colour_depth(maps.median))
     elif maps.depth is not None:

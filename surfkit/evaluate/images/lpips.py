@@ -102,7 +102,7 @@ class Perceptual:
 
 def _mean_where(apart: Tensor, mask: Tensor) -> Tensor:
     """Mean of an (h, w) map, each place weighted by the share of its pixels that count in the (H, W) mask."""
-    weight = functional.adaptive_avg_pool2d(mask.to(apart)[None, None], apart.shape)[0, 0]
+    weight = functional.adaptive_avg_pool2d(mask.to(apart)[None, None], (apart.shape[0], apart.shape[1]))[0, 0]
     return (apart * weight).sum() / weight.sum().clamp_min(1e-12)
 
 

@@ -91,7 +91,8 @@ def evaluate_views(
             continue
         maps = draw(view)
         if mask is None or mask.any():
-            render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
+            color = maps.need("color")
+            render, target = color.clamp(0, 1), photo.to(color) / 255
             mask = None if mask is None else mask.to(render.device)
             per_image[view.name] = _measured(render, target, mask, correct_color)
             per_image[view.name] |= lpips_values(networks, render, target, mask)
@@ -144,9 +145,9 @@ def frames_per_second(views: Sequence[View], draw: Draw, warmup: int = 2, most: 
 
 def _seconds(view: View, draw: Draw) -> float:
     start = time.perf_counter()
-    maps = draw(view)
-    if maps.color.is_cuda:
-        torch.cuda.synchronize(maps.color.device)
+    color = draw(view).need("color")
+    if color.is_cuda:
+        torch.cuda.synchronize(color.device)
     return time.perf_counter() - start
 
 

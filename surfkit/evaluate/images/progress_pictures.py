@@ -45,7 +45,7 @@ class ProgressPictures:
                 emit(PhotoSkipped(view.name, str(error)))
                 continue
             maps = draw(view)
-            found[view.name] = psnr(maps.color, photo.to(maps.color) / 255)
+            found[view.name] = psnr(maps.need("color"), photo.to(maps.need("color")) / 255)
             path = picture_path(self.folder / f"{index:06}", view.name)
             write_picture(path, panel(photo, maps))
             emit(FileWritten(path, "picture"))

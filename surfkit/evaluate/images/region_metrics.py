@@ -46,7 +46,7 @@ def measure_parts(
         except BadInput as error:
             emit(PhotoSkipped(counted.view.name, str(error)))
             continue
-        render = draw(counted.view).color.cpu().clamp(0, 1)
+        render = draw(counted.view).need("color").cpu().clamp(0, 1)
         target = photo.to(render) / 255
         total += target[0].numel() if keep is None else int(keep.sum())
         for name, mask in parts(counted).items():
@@ -70,7 +70,7 @@ def by_views(least: tuple[int, ...]) -> Callable[[ViewCounts], Masks]:
     """Parts seen by so many training views or more, and by fewer, for each of some numbers."""
 
     def parts(counted: ViewCounts) -> Masks:
-        found = {}
+        found: Masks = {}
         for number in least:
             enough = counted.full(counted.counts >= number)
             found |= {f"{number}": enough, f"<{number}": ~enough}

@@ -40,7 +40,7 @@ class MeshCube:
 
     def has(self, points: np.ndarray) -> np.ndarray:
         """(...,) bool, which of (..., 3) points lie in the cube; of those on borders between cubes, each in one."""
-        return ((points >= self.low) & (points < self.high)).all(-1)
+        return np.all((points >= self.low) & (points < self.high), axis=-1)
 
 
 def boxes(mesh: WholeMesh, side: float, chosen: np.ndarray, margin: float = 0.0) -> list[MeshCube]:

@@ -60,15 +60,17 @@ def crossings(mesh: WholeMesh) -> Crossings:
         crossing = int(crossing_faces(mesh, np.arange(total)).sum())
         return Crossings(crossing / total, crossing, total)
     side = float(np.sqrt(TRIANGLES_PER_CUBE * max(np.median(mesh.areas), mesh.area / total * MIN_MEAN_AREA_SHARE)))
-    crossing, measured, chosen = [], [], []
+    crossed: list[int] = []
+    measured: list[int] = []
+    chosen: list[int] = []
     for box in boxes(mesh, side, by_number(mesh, SAMPLED_CUBES)):
         within = box.has(mesh.corners(box.faces)).all(1)
         if within.any():
-            crossing.append(int((crossing_faces(mesh, box.faces) & within).sum()))
+            crossed.append(int((crossing_faces(mesh, box.faces) & within).sum()))
             measured.append(int(within.sum()))
             chosen.append(box.chosen)
-    share = float(np.average(np.divide(crossing, measured), weights=chosen)) if chosen else None
-    return Crossings(share, sum(crossing), sum(measured), len(chosen), side)
+    share = float(np.average(np.divide(crossed, measured), weights=chosen)) if chosen else None
+    return Crossings(share, sum(crossed), sum(measured), len(chosen), side)
 
 
 def crossing_faces(mesh: WholeMesh, faces: np.ndarray) -> np.ndarray:
@@ -91,7 +93,7 @@ def cross(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """
     found = np.zeros(len(one), bool)
     rows = np.arange(len(one))
-    sides = []
+    sides: list[np.ndarray] = []
     for a, b in ((one, other), (other, one)):
         normal = np.cross(a[rows, 1] - a[rows, 0], a[rows, 2] - a[rows, 0])
         height = np.einsum("nij,nj->ni", b[rows] - a[rows, :1], normal)

@@ -49,10 +49,10 @@ def measure_mesh(mesh: SurfaceFile, metres: float | None = None) -> MeshMeasure:
     figures = {
         "file": str(mesh.path),
         "unit": "unit" if metres is None else "m",
-        "triangles": len(mesh.faces),
-        "degenerate": len(mesh.faces) - len(whole.faces),
+        "triangles": len(mesh.triangles),
+        "degenerate": len(mesh.triangles) - len(whole.faces),
         "area": area,
-        "triangles_per_area": len(mesh.faces) / area,
+        "triangles_per_area": len(mesh.triangles) / area,
         **asdict(edges),
         "boundary_share": edges.boundary_edges / edges.edges,
         "crossing": asdict(found) | {"side": found.side and found.side * unit},

@@ -55,11 +55,11 @@ def whole_mesh(mesh: SurfaceFile) -> WholeMesh:
     """
     places = _places(mesh.rows)
     stands_for = first_in_place(places)
-    faces = np.empty((len(mesh.faces), 3), np.int32)
+    faces = np.empty((len(mesh.triangles), 3), np.int32)
     areas, extents = np.empty(len(faces), np.float32), np.empty(len(faces), np.float32)
     count = 0
     for start in range(0, len(faces), BLOCK_POINTS):
-        block = np.asarray(mesh.faces[start : start + BLOCK_POINTS])
+        block = np.asarray(mesh.triangles[start : start + BLOCK_POINTS])
         block = block if stands_for is None else stands_for[block]
         a, b, c = block.T
         block = block[(a != b) & (b != c) & (c != a)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -135,14 +136,10 @@ class GpuGrid(TsdfGrid):
             return False
         try:
             while len(self.chunks) * CHUNK_BLOCKS < blocks:
-                made = (
-                    ((BLOCK_SIDE_VOXELS**3,), torch.int16),
-                    ((BLOCK_SIDE_VOXELS**3,), torch.int16),
-                    ((3, BLOCK_SIDE_VOXELS**3), torch.uint8),
-                )
-                self.chunks.append(
-                    tuple(torch.zeros(CHUNK_BLOCKS, *shape, dtype=dtype, device=self.device) for shape, dtype in made)
-                )
+                size = CHUNK_BLOCKS, BLOCK_SIDE_VOXELS**3
+                distance, weight = (torch.zeros(size, dtype=torch.int16, device=self.device) for _ in range(2))
+                color = torch.zeros(size[0], 3, size[1], dtype=torch.uint8, device=self.device)
+                self.chunks.append((distance, weight, color))
         except torch.cuda.OutOfMemoryError:
             if not self.chunks:
                 raise no_room(self.device, CHUNK_BLOCKS * BLOCK_BYTES) from None
@@ -174,7 +171,7 @@ def view_of(lattice: Lattice, camera: Camera) -> GridView:
     reach = BLOCK_REACH_VOXELS * lattice.voxel * per_block
     size, lens = (camera.width, camera.height), (camera.fx, camera.fy, camera.cx, camera.cy)
     groups = turn, shift, eye, side, per_block, reach, lattice.low, last, size, lens, lattice.lengths
-    fields = zip(GridView._fields_, groups, strict=True)
+    fields: zip[tuple[tuple[str, Any], Any]] = zip(GridView._fields_, groups, strict=True)
     return GridView(*(value if isinstance(value, float) else kind(*value) for (_, kind), value in fields))
 
 

@@ -14,12 +14,18 @@ MIN_MEASURED_S = 3.0
 class TimedBlock(Protocol):
     """The fields of `surfkit.runs.execute.block_state.BlockState` that are needed."""
 
-    status: str
-    step: int
-    steps: int
-    first: int
-    began: float
-    heard: float
+    @property
+    def status(self) -> str: ...
+    @property
+    def step(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def first(self) -> int: ...
+    @property
+    def began(self) -> float: ...
+    @property
+    def heard(self) -> float: ...
 
 
 def seconds_elapsed(block: TimedBlock) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
@@ -86,12 +87,12 @@ def shared_mean(parts: Sequence[StageState], shares: Sequence[BlockContribution]
     coarse, *blocks = [part.points.shared for part in parts]
     if not blocks:
         return coarse
-    return {
-        name: sum(block[name].double() * weight for block, weight in zip(blocks, weights, strict=True))
-        .div(total)
-        .to(value)
-        for name, value in coarse.items()
-    }
+
+    def mean(name: str, like: Tensor) -> Tensor:
+        parts = (block[name].double() * weight for block, weight in zip(blocks, weights, strict=True))
+        return (sum(parts, like.new_zeros((), dtype=torch.float64)) / total).to(like)
+
+    return {name: mean(name, value) for name, value in coarse.items()}
 
 
 def open_result(block: BlockRun, steps: int) -> StoredState | None:

@@ -68,6 +68,7 @@ def end_round(blocks: Sequence[BlockRun], results: Sequence[StoredState]) -> Non
     """Write what the blocks agree on at the end of a round, given their states there."""
     run = blocks[0].run
     rule, number = consensus_of(run.recipe), rounds_agreed(run) + 1
+    assert rule is not None, "rounds end where blocks agree"
     before = load_agreement(run, number - 1) if number > 1 else None
     if number > 1 and before is None:
         raise BadInput(f"{agreement_file(run, number - 1)} is gone; delete {run.blocks} to tune all blocks anew")
@@ -166,6 +167,6 @@ class AgreedMerge:
                     copies.append(PointCopies(own[low:high], there))
             if copies:
                 means, counts = mean_copies(copies, ids)
-                there = counts > 0
-                params = {n: torch.where(there.view(-1, *[1] * (v.dim() - 1)), means[n], v) for n, v in params.items()}
+                known = counts > 0
+                params = {n: torch.where(known.view(-1, *[1] * (v.dim() - 1)), means[n], v) for n, v in params.items()}
             yield params

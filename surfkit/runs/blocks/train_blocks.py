@@ -10,10 +10,11 @@ import itertools
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import write_json
@@ -147,6 +148,7 @@ def load_or_make_plan(ctx: RunContext, coarse: StoredState, optimise_partition: 
 def make_plan(ctx: RunContext, coarse: StoredState) -> BlocksRecord:
     """Plan the blocks, and write the plan and its picture."""
     recipe, path = ctx.run.recipe, plan_file(ctx.run)
+    assert recipe.partition is not None, "only a recipe with a partition has blocks"
     model = sight = activate_coarse_model(ctx, checkpoint.load(coarse.path))
     if (other := ctx.run.partition) is not None:
         sight = activate_coarse_model(replace(ctx, run=other), checkpoint.load(open_coarse_model(other).path))
@@ -215,8 +217,9 @@ def train_all(ctx: RunContext, blocks: Sequence[BlockRun], coarse: StoredState, 
     train_waiting(ctx, waiting, compute, len(blocks))
     while (goal := blocks[0].goal) < ctx.run.recipe.tune.steps:
         results = {block: open_result(block, goal) for block in blocks if block.planned.views}
-        if None not in results.values():
-            end_round(blocks, list(results.values()))
+        ready = [stored for stored in results.values() if stored is not None]
+        if len(ready) == len(results):
+            end_round(blocks, ready)
         train_waiting(ctx, unfinished(blocks), compute, len(blocks))
 
 
@@ -281,13 +284,13 @@ def describe(failed: Mapping[BlockRun, str]) -> str:
 
 def run_jobs(
     ctx: RunContext, batch: Sequence[BlockRun], compute: Compute, look: Callable[[], BlockProgress]
-) -> Iterator[tuple[BlockRun, JobResult]]:
+) -> Generator[tuple[BlockRun, JobResult], None, None]:
     """The blocks of a batch as their jobs end, with their states read again; other processes' progress is shown."""
     by_index = {block.index: block for block in batch}
     jobs = [job_of(ctx, block, compute) for block in batch]
     with (
         nullcontext() if compute.workers.in_process else BlockDisplay(look),
-        closing(compute.workers.run(jobs)) as results,
+        closing(cast(Generator[JobResult, None, None], compute.workers.run(jobs))) as results,  # see `Executor.run`
     ):
         for result in results:
             block = by_index[result.job.index]

@@ -129,6 +129,7 @@ def take_steps(ctx: RunContext, block: BlockRun) -> None:
             state = optimise(replace(job, until=until), take_in(block, state))
     else:
         say(f"{stage.title} has all its {goal} steps already")
+    assert state is not None, "a goal is a step, so there is a state at it"
     block.write(status="done" if state.index >= steps else "planned", step=state.index, steps=steps)
 
 

@@ -103,9 +103,9 @@ def load_state(content: dict[str, Any], where: str) -> BlockState:
     return load(BlockState, {FORMER_NAMES.get(name, name): value for name, value in content.items()}, where)
 
 
-def write_state(folder: Path, state: BlockState, **changes: object) -> BlockState:
+def write_state(folder: Path, state: BlockState, **changes: Any) -> BlockState:
     """Save a state of a block with some changes, as a heartbeat of this process; the new state."""
-    heartbeat = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
+    heartbeat: dict[str, Any] = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
     state = replace(state, **(heartbeat | changes))
     write_json(state_path(folder), state)
     return state

@@ -109,18 +109,18 @@ class RemoteJob:
         if missing := self.missing():
             return RemoteResult(2, host, f"machine {host}: {missing}", "data")
         with interrupts_noted() as came:
-            self.begin()
+            process = self.begin()
             try:
-                while self.process.poll() is None and not came:
+                while process.poll() is None and not came:
                     time.sleep(CHILD_POLL_S)
             finally:
                 self.stop()
         if came:
             raise KeyboardInterrupt
-        if self.process.returncode == INTERRUPTED_STATUS:
+        if process.returncode == INTERRUPTED_STATUS:
             time.sleep(self.hold_s)
-        killed = self.process.returncode == -signal.SIGKILL and oom_kills() > kills
-        return RemoteResult(self.process.returncode, host, kind="oom" if killed else None)
+        killed = process.returncode == -signal.SIGKILL and oom_kills() > kills
+        return RemoteResult(process.returncode, host, kind="oom" if killed else None)
 
     def missing(self) -> str | None:
         """What this machine lacks to run it, as a message; None if nothing."""
@@ -133,11 +133,11 @@ class RemoteJob:
             return f"it has surfkit {own_version()}, and the run is of {self.version}; install the same on all machines"
         return None
 
-    def begin(self) -> None:
+    def begin(self) -> subprocess.Popen[bytes]:
         """Start the process."""
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         with open(self.log, "ab") as log:
-            self.process = subprocess.Popen(
+            self.process = process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", WATCHDOG, *self.words],
                 env={**os.environ, **self.variables, **limits, DRIVER: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
@@ -145,6 +145,7 @@ class RemoteJob:
                 stderr=log,
                 start_new_session=True,
             )
+        return process
 
     def stop(self) -> None:
         """Ask it to save its state and end, and wait until it has. Safe in a signal handler, unlike `Popen.wait`."""

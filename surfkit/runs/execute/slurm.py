@@ -39,7 +39,7 @@ JOB_HOLD_S, CANCEL_TIMEOUT_S = 120.0, 60.0
 """How long a job that was asked to end waits until Slurm ends it, and how long we wait for those that we cancelled."""
 RESULT_ARRIVAL_S = 90.0
 """How long after its end the result of a job may take to be seen here."""
-ALIVE_STATES = (
+ALIVE_STATES: tuple[str, ...] = (
     "PENDING",
     "CONFIGURING",
     "RUNNING",
@@ -156,7 +156,8 @@ class Slurm(Executor):
         """What submits the jobs."""
         submitit = _imported()
         memory = self.memory_gb or math.ceil(max(job.memory_bytes for job in jobs) / 1e9)
-        more = dict((option.split("=", 1) if "=" in option else (option, True)) for option in self.extra)
+        options = (option.partition("=") for option in self.extra)
+        more = {name: value if equals else True for name, equals, value in options}
         given = submitit.AutoExecutor(folder, self.cluster, slurm_max_num_timeout=self.requeues)
         given.update_parameters(
             name=f"surfkit-{folder.parent.parent.name}",
