@@ -17,6 +17,8 @@ PAGES = sorted(
         *(ROOT / "examples").glob("*/README.md"),
     ]
 )
+NOTES = sorted((ROOT / "bench" / "log").glob("*.md"))
+"""Notes of one time: their links lead somewhere, their commands may be those of then."""
 FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]*)\")?\n(.*?)^```$", re.M | re.S)
 INDENTED = re.compile(r"(?:(?<=\n\n)|\A)(?: {4}.*\n|\n(?= {4}))+", re.M)
 

@@ -67,7 +67,8 @@ CITY = replace(
     ),
     # The paper does not say what becomes of points around a block. On shibuya-synth at an eighth of the size, two
     # blocks, 300 steps each stage, two seeds: densified 17.75 and 17.57 dB, tuned 18.13 and 18.22, frozen 17.94 and
-    # 18.06; frozen takes a tenth less CPU time and memory than tuned (docs/measured.md has more steps: 2 % at 3,000).
+    # 18.06; frozen takes a tenth less CPU time and memory than tuned (bench/log/blocks_and_methods.md has more steps:
+    # 2 % at 3,000).
     context="tuned",
 )
 
