@@ -3,7 +3,7 @@
     python bench/block_memory.py [--tiles 1 4 16] [--points 100000] [--steps 8]
 
 Scenes of 1, 4 and 16 tiles, each with as many cameras, points and pixels, and one block to a tile. The coarse model is
-made up: the sparse points, as they begin. Then one block is tuned by `surfkit tune`, and the blocks are merged (each
+made up: the sparse points, as they begin. Then one block is tuned by `surfkit train-block`, and the blocks are merged (each
 of them as it was given) and opened again, each in a process of its own, of which the peak is what the system tells.
 A block is tuned on the cameras that stand inside it, so that it has the same to do in every scene.
 """
@@ -26,7 +26,7 @@ SIDE_M, ACROSS, MARGIN_M = 100.0, 5, 2.5
 """Metres of a tile, cameras along it, and metres of points around the scene, so that views on its rim show no less."""
 WIDTH, HEIGHT = 640, 480
 HERE = Path(__file__).parents[1]
-PROGRAM = "import surfkit.apps.tune, surfkit.core.memory as m"
+PROGRAM = "import surfkit.apps.train_block, surfkit.core.memory as m"
 
 MAKE = """
 import sys, torch
@@ -145,7 +145,7 @@ def measured(tiles: int, points: int, steps: int) -> dict[str, float]:
         data, out = Path(place) / "data", Path(place) / "run"
         write_data(data, across, points)
         subprocess.run([sys.executable, "-c", MAKE, str(data), str(out), str(across), str(steps)], check=True)
-        tuned = peak_mb("-m", "surfkit.cli", "tune", str(out), block, "--device", "cpu", "--cache", "100MB")
+        tuned = peak_mb("-m", "surfkit.cli", "train-block", str(out), block, "--device", "cpu", "--cache", "100MB")
         parts = [json.loads(line) for line in (out / "blocks" / f"{int(block):03}" / "events.jsonl").open()]
         begun = next(line["points"] for line in parts if line["event"] == "StageBegan")
         coarse = (out / "pretrain" / "checkpoint.safetensors").stat().st_size / 1e6

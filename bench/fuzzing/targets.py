@@ -155,7 +155,7 @@ TARGETS = {
     "stopped-run": Target(lambda here: run_folder(here, stop="pretrain"), COMMANDS[::3], ("out/*", "out/pretrain/*")),
     "blocks": Target(
         lambda here: run_folder(here, BLOCKS, "block 1"),
-        (BLOCKS, COMMANDS[0], "tune {here}/out 1 --device cpu --cache 1MB"),
+        (BLOCKS, COMMANDS[0], "train-block {here}/out 1 --device cpu --cache 1MB"),
         ("out/blocks/*.json", "out/blocks/*.json", "out/blocks/0*/*", "out/blocks/0*/tune/*"),
     ),
     "comparison": Target(

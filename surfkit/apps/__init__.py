@@ -13,8 +13,8 @@ def surfkit_commands():
             goes_on=True,
             memory_advice="smaller photographs (--longest, --scale) or fewer points need less",
         ),
-        "tune": LazyCommand(
-            "surfkit.apps.tune",
+        "train-block": LazyCommand(
+            "surfkit.apps.train_block",
             "Train one block of a large scene, in its own process or on another machine.",
             goes_on=True,
         ),

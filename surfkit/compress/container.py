@@ -150,7 +150,7 @@ class ModelFile:
 
     @cached_property
     def tables(self) -> dict[str, np.ndarray]:
-        """What all leaves share."""
+        """What all leaves share, by name: arrays (rows, components)."""
         found = {}
         for name, entry in self.index.tables.items():
             with self._naming(f"table {name}"):

@@ -88,7 +88,7 @@ def flat(values: Columns, name: str) -> np.ndarray:
 
 
 def stream(streams: Streams, name: str, rows: int, components: int) -> np.ndarray:
-    """A stream of the shape that it must have, or BadInput."""
+    """A stream (rows, components), or BadInput where it has another shape."""
     found = streams.get(name)
     if found is None or found.shape != (rows, components):
         what = "is missing" if found is None else f"is {found.shape[0]} x {found.shape[1]}"

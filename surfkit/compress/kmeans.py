@@ -169,7 +169,7 @@ class Lloyd:
         return self.vectors[torch.from_numpy(np.concatenate([chosen, others]))]
 
     def improved(self, codebook: Tensor) -> Tensor:
-        """Each code at the mean of its vectors, after some are merged and others split."""
+        """(codes, D) each code at the mean of its vectors, after some are merged and others split."""
         search = searching(codebook, self.features, self.device)
         index, distance = self.assigned(search)
         means = Means.of(self.sums(index, self.codes), codebook)
@@ -199,6 +199,11 @@ class Lloyd:
         """The means of both halves of the vectors of each code, first of one half and then of the other.
 
         They are halved by their direction from the mean: that of the largest error, and then that from half to half.
+
+        Args:
+            index: (N,) the code of each vector.
+            distance: (N,) how far it is from it, squared.
+            means: Of the codes.
         """
         order = np.argsort(distance.cpu().double().numpy() * self.weight, kind="stable")
         farthest = np.zeros(self.codes, np.int64)
@@ -231,7 +236,7 @@ class Means:
         return cls(weight, np.where(weight[:, None] > 0, mean, np.asarray(before, np.float64)))
 
     def parting(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """How much more the sum is when the vectors of two codes have one mean, not two."""
+        """(K,) how much more the sum is when the vectors of two codes, (K,) each, have one mean, not two."""
         together = np.maximum(self.weight[one] + self.weight[other], np.finfo(float).tiny)
         apart = squares(self.places[one] - self.places[other])
         return self.weight[one] / together * self.weight[other] * apart

@@ -66,7 +66,7 @@ def nearest(vectors: Tensor, codebook: Tensor, device: torch.device = CPU) -> tu
 
 
 def checked(name: str, vectors: Tensor) -> Tensor:
-    """The matrix on the CPU, contiguous.
+    """The matrix (N, D) on the CPU, contiguous.
 
     Raises:
         BadInput: Unless it is a float32 matrix of finite values up to 1e15.
@@ -122,7 +122,10 @@ class DistanceBounds:
         return torch.cat([turned[:, : self.used], turned[:, self.used :].norm(dim=1, keepdim=True)], 1)
 
     def fitted(self, vectors: Tensor, codebook: Tensor) -> DistanceBounds:
-        """With as many components as make the search fastest: with few, distances to many codes must be computed."""
+        """With as many components as make the search of (N, D) vectors in (codes, D) fastest.
+
+        With few, distances to many codes must be computed.
+        """
         dimensions, blocks = codebook.shape[1], len(codebook) // CODES_PER_BLOCK
         some = vectors[:: max(1, len(vectors) // min(PROBE_VECTORS, max(8, MAX_TORCH_DISTANCES // len(codebook))))]
         here, there = self._turned(some), self._turned(codebook[self.order(codebook)[: blocks * CODES_PER_BLOCK]])
@@ -153,7 +156,7 @@ class DistanceBounds:
 
 
 def itself(vectors: Tensor) -> Tensor:
-    """In place of features, for searches that have no use for them."""
+    """(N, D) in place of features, for searches that have no use for them."""
     return vectors
 
 
@@ -222,7 +225,7 @@ class TorchSearch(Search):
 
 
 def searching(codebook: Tensor, features: Callable[[Tensor], Tensor], device: torch.device = CPU) -> Search:
-    """The codebook on a device: for a GPU, or compiled if surfkit is."""
+    """The codebook, (codes, D), on a device: for a GPU, or compiled if surfkit is."""
     if device.type == "cuda":
         return GpuSearch(codebook, device)
     if module() is None:

@@ -216,7 +216,7 @@ def float_bits(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
 
 
 def bits_float(bits: np.ndarray, kind: str) -> np.ndarray:
-    """The floats of `float_bits`."""
+    """(N, K) the floats of `float_bits`."""
     floats = FLOAT_TYPES[kind]
     if bits.dtype.itemsize != np.dtype(floats).itemsize:
         raise BadInput(f"a stream of {kind} has numbers of {bits.dtype.itemsize} bytes")

@@ -94,7 +94,7 @@ Streams = Mapping[str, np.ndarray | Stored]
 
 
 def array(stream: np.ndarray | Stored) -> np.ndarray:
-    """The numbers of a stream; BadInput if it is damaged."""
+    """The (rows, components) numbers of a stream; BadInput if it is damaged."""
     return stream.numbers() if isinstance(stream, Stored) else stream
 
 

@@ -238,7 +238,7 @@ class Gradients:
         return {name: getattr(self, name) for name in STANDARD}
 
     def named(self) -> dict[str, Tensor]:
-        """All gradients by name, of the shapes of the tensors."""
+        """All gradients by name, (N, ...) each; of what is shared, the shape of the parameter."""
         return self.tensors() | dict(self.extra)
 
 

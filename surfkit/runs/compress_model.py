@@ -131,7 +131,10 @@ def writing(
     seed: int,
     device: torch.device = torch.device("cpu"),
 ) -> Callable[[Path, Compressor], int]:
-    """What writes a model as `.surfkit` file with a compressor, tells its progress, and returns the bytes."""
+    """What writes a model as `.surfkit` file with a compressor, tells its progress, and returns the bytes.
+
+    `importance`: (N,) of the points, or None.
+    """
 
     def write(path: Path, compressor: Compressor) -> int:
         plan = compressor.plan(model, importance, seed, device)

@@ -81,12 +81,12 @@ class LazyPhotos:
 
     @cached_property
     def photos(self) -> Cache[torch.Tensor]:
-        """Photographs by position."""
+        """Photographs by position, (3, H, W) uint8."""
         return photo_cache(self.scene.train, self.budget_bytes)
 
     @cached_property
     def masks(self) -> Cache[torch.Tensor | None] | None:
-        """Masks by position."""
+        """Masks by position, (H, W) bool or None."""
         return mask_cache(self.scene.train, self.budget_bytes)
 
     def photo(self, at: int) -> torch.Tensor:

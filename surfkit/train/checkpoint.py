@@ -269,7 +269,7 @@ def _digest(tensors: Mapping[str, Tensor], facts: str) -> str:
 
 
 def digest(facts: str, tensors: Iterable[tuple[str, Tensor, Iterable[Tensor]]]) -> str:
-    """SHA-256 of facts and tensors.
+    """SHA-256 of facts and tensors, (N, ...) each.
 
     Args:
         facts: As in the file.

@@ -63,7 +63,7 @@ BLOCKS = f"train recipe:2dgs {RUN} {CUT} --data {{m}}/data --out {{m}}/blocks"
         ("crop.json", "mesh {m}/run --device cpu --crop {m}/crop.json", ""),
         ("crop.json", f"{GT} --crop none --transform {{m}}/crop.json", ""),
         ("blocks/blocks/plan.json", "status {m}/blocks", ""),
-        ("blocks/blocks/plan.json", "tune {m}/blocks 0 --device cpu", ""),
+        ("blocks/blocks/plan.json", "train-block {m}/blocks 0 --device cpu", ""),
         ("blocks/blocks/000/state.json", "status {m}/blocks", "{}"),
         ("data/estimated_depths/depth.json", f"{SWEEP} --device cpu", ""),
     ],

@@ -416,13 +416,13 @@ def test_blocks_in_processes_of_their_own_find_the_maps(farm, recipe, tmp_path, 
         (own_cache / "depth").rename(own_cache / "gone")
         shutil.rmtree(tmp_path / "inline/blocks/000/tune")
         state = tmp_path / "inline/blocks/000/state.json"
-        assert main(["tune", str(tmp_path / "inline"), "0"]) == 2
+        assert main(["train-block", str(tmp_path / "inline"), "0"]) == 2
         err = capsys.readouterr().err
         assert "set SURFKIT_CACHE to a folder that both see" in err and state.exists()
         (own_cache / "gone").rename(tmp_path / "elsewhere-too")
         (tmp_path / "elsewhere").mkdir()
         (tmp_path / "elsewhere-too").rename(tmp_path / "elsewhere/depth")
-        assert main(["tune", str(tmp_path / "inline"), "0"]) == 0
+        assert main(["train-block", str(tmp_path / "inline"), "0"]) == 0
 
 
 def test_the_words_of_the_command_line(farm, tmp_path, own_cache, capsys):

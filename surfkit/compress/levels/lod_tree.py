@@ -95,7 +95,7 @@ class LodBlocks:
         return found
 
     def front(self, camera: Camera, pixels: float, near: float | None = None) -> np.ndarray:
-        """Positions of the blocks to draw: each point of the full model has exactly one above it or is in it.
+        """(K,) positions of the blocks to draw: each point of the full model has exactly one above it or is in it.
 
         As an error never rises from a block to its children and their boxes lie in its box, a block is drawn where its
         own error is small enough and that of its parent is not.
@@ -155,7 +155,8 @@ class LodTree:
     def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> LodTree:
         """The tree of a list of blocks, the root first and parents before children.
 
-        Boxes are found, and the errors of parents are raised to those of their children.
+        Boxes are found, and the errors of parents are raised to those of their children. `order`: (N,) of the points of
+        the full model.
         """
         count = len(blocks)
         low, high, reach = np.full((count, 3), np.inf), np.full((count, 3), -np.inf), np.zeros(count)
@@ -182,7 +183,7 @@ class LodTree:
         return first
 
     def rows(self, front: np.ndarray) -> torch.Tensor:
-        """Rows of `joined` of some blocks."""
+        """(R,) rows of `joined` of (K,) blocks."""
         before = np.concatenate([[0], np.cumsum([len(level) for level in self.levels])])
         blocks = self.blocks
         start = before[blocks.level[front]]

@@ -97,7 +97,7 @@ def halved(level: SplatModel, known: Moments, ends: np.ndarray, number: int) -> 
 
 
 def carried(before: SplatModel, after: SplatModel, labels: np.ndarray, known: Moments) -> Moments:
-    """What is known of the points of the next level."""
+    """What is known of the points of the next level; `labels`: (N,), into which of them each point goes."""
     weights, spread = known
     places, means = (each.splats.means.detach().double().cpu().numpy() for each in (before, after))
     far = ((places - means[labels]) ** 2).sum(1)
@@ -112,7 +112,12 @@ def block_errors(known: Moments, ends: np.ndarray) -> np.ndarray:
 
 
 def blocks(limits: list[np.ndarray], errors: list[np.ndarray]) -> list[LodBlock]:
-    """The blocks of all levels, the root first; `limits` and `errors` of each level, the finest first."""
+    """The blocks of all levels, the root first.
+
+    Args:
+        limits: Of each level, the finest first: (B + 1,) rows at which its blocks begin and end.
+        errors: Of each level: (B,) of its blocks.
+    """
     found: list[LodBlock] = []
     above = -1
     for level in range(len(limits) - 1, -1, -1):

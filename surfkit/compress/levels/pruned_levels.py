@@ -127,7 +127,12 @@ def sights(levels: Sequence[SplatModel], ends: Sequence[np.ndarray]) -> list[np.
 
 
 def chains(ends: Sequence[np.ndarray], errors: Sequence[np.ndarray]) -> Iterator[LodBlock]:
-    """The blocks: the whole coarsest level, below it each of its parts, and below these the same in finer levels."""
+    """The blocks: the whole coarsest level, below it each of its parts, and below these the same in finer levels.
+
+    Args:
+        ends: Of each level, the finest first: (B + 1,) rows at which its parts begin and end.
+        errors: Of each level: (B,) of its parts.
+    """
     coarsest, count = len(ends) - 1, len(ends[0]) - 1
     before = 0
     if count > 1:

@@ -80,7 +80,7 @@ def end_round(blocks: Sequence[BlockRun], results: Sequence[StoredState]) -> Non
 
 
 def copies_of(stored: StoredState, ids: Tensor) -> PointCopies:
-    """Those among some points that a block has, without reading the others all at once."""
+    """Those among some points, (P,) int64, that a block has, without reading the others all at once."""
     own, parts = stored.column(ID), []
     kept = torch.isin(own, ids)
     begin = 0

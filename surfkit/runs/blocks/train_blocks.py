@@ -352,7 +352,15 @@ def job_of(ctx: RunContext, block: BlockRun, compute: Compute) -> Job:
     """The job that trains one block."""
     elsewhere = compute.workers.at_once is None
     share = ctx.caches.bytes() // (compute.workers.at_once or 1)
-    command = ["-m", "surfkit.cli", "tune", str(ctx.run.out.resolve()), str(block.index), "--device", compute.device]
+    command = [
+        "-m",
+        "surfkit.cli",
+        "train-block",
+        str(ctx.run.out.resolve()),
+        str(block.index),
+        "--device",
+        compute.device,
+    ]
     command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
     command += ["--gpu-cache", ctx.caches.gpu]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]

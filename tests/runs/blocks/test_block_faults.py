@@ -187,7 +187,7 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
     def limited(ctx, block, compute):
         job = command(ctx, block, compute)
         code = (
-            "import resource, sys, psutil, torch\nfrom surfkit.cli import main\nimport surfkit.apps.tune\n"
+            "import resource, sys, psutil, torch\nfrom surfkit.cli import main\nimport surfkit.apps.train_block\n"
             "from surfkit.train.trainer import Trainer\nstep = Trainer.step\n"
             "def hungry(self, state):\n    held = torch.empty(10_000_000 * len(state.points), dtype=torch.uint8)\n"
             "    return step(self, state)\nTrainer.step = hungry\n"

@@ -246,7 +246,7 @@ def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
     other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"held\n"
-        assert main(["tune", str(tmp_path / "run"), "0"]) == worker.BUSY_STATUS
+        assert main(["train-block", str(tmp_path / "run"), "0"]) == worker.BUSY_STATUS
     finally:
         other.kill()
         other.wait()
@@ -282,10 +282,10 @@ def test_blocks_of_a_plan_that_is_gone_are_put_aside(undisturbed, data, recipe, 
 
 
 def test_tune_by_hand(undisturbed, tmp_path, capsys):
-    assert main(["tune", str(undisturbed), "0"]) == 0
+    assert main(["train-block", str(undisturbed), "0"]) == 0
     assert "block 0 has all its " in capsys.readouterr().err
-    assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
-    assert main(["tune", str(tmp_path), "0"]) == 2
+    assert main(["train-block", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
+    assert main(["train-block", str(tmp_path), "0"]) == 2
 
 
 def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, monkeypatch):
@@ -324,14 +324,16 @@ def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_pa
     model, away = data.path / "sparse", tmp_path / "sparse"
     model.rename(away)
     try:
-        assert main(["tune", str(tmp_path / "run"), "1", "--device", "cpu"]) == 0
+        assert main(["train-block", str(tmp_path / "run"), "1", "--device", "cpu"]) == 0
     finally:
         away.rename(model)
     run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed)
     (folder / "views.npz").write_bytes(b"damaged")
     (folder / "state.json").unlink()
-    assert main(["tune", str(tmp_path / "run"), "1"]) == 2 and "views.npz cannot be used" in capsys.readouterr().err
+    assert (
+        main(["train-block", str(tmp_path / "run"), "1"]) == 2 and "views.npz cannot be used" in capsys.readouterr().err
+    )
     run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert read_state(folder).status == "done"
 

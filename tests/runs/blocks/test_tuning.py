@@ -76,13 +76,13 @@ def elsewhere(undisturbed, tmp_path):
 
 def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
     folder = elsewhere(-LATER_S)
-    assert main(["tune", str(folder), "0"]) == worker.BUSY_STATUS
+    assert main(["train-block", str(folder), "0"]) == worker.BUSY_STATUS
     assert (
         "process 7 on far sent a heartbeat" in capsys.readouterr().err
         and read_state(folder / "blocks/000").host == "far"
     )
     elsewhere(STALE_S - 3)
-    assert main(["tune", str(folder), "0", "--patience", "60"]) == 0
+    assert main(["train-block", str(folder), "0", "--patience", "60"]) == 0
     assert read_state(folder / "blocks" / "000").host != "far"
 
 

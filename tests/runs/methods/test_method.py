@@ -230,7 +230,7 @@ def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data,
     assert "the method of the run made its mesh" in refused("mesh", out, "--mesh.voxel", 1)
     assert "has no points; draw --of loss" in refused("curves", out, "--out", tmp_path / "curves.png")
     assert "does not draw pictures" in refused("evaluate", out, "--gt", out / "mesh.ply", "--tau", 1, "--seen", 2)
-    assert "no blocks" in refused("tune", out, 0)
+    assert "no blocks" in refused("train-block", out, 0)
     curve = ["curves", str(out), "--of", "loss", "--out", str(tmp_path / "curves.png")]
     assert main(curve) == 0 and (tmp_path / "curves.png").exists()
     assert main(["mesh", str(out), "--formats", "ply", "obj"]) == 0 and (out / "mesh.obj").exists()

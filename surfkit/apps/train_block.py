@@ -1,4 +1,4 @@
-"""`surfkit tune`."""
+"""`surfkit train-block`."""
 
 from __future__ import annotations
 
