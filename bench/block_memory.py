@@ -2,10 +2,10 @@
 
     python bench/block_memory.py [--tiles 1 4 16] [--points 100000] [--steps 8]
 
-Scenes of 1, 4 and 16 tiles, each with as many cameras, points and pixels, and one block to a tile. The coarse model is
-made up: the sparse points, as they begin. Then one block is tuned by `surfkit train-block`, and the blocks are merged
-(each of them as it was given) and opened again, each in a process of its own, of which the peak is what the system tells.
-A block is tuned on the cameras that stand inside it, so that it has the same to do in every scene.
+Scenes of 1, 4 and 16 tiles, each with as many cameras, points and pixels, and one block to a tile. The coarse model
+is made up: the sparse points, as they begin. Then one block is tuned by `surfkit train-block`, and the blocks are
+merged (each of them as it was given) and opened again, each in a process of its own, of which the peak is what the
+system tells. A block is tuned on the cameras that stand inside it, so that it has the same to do in every scene.
 """
 
 from __future__ import annotations
