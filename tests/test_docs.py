@@ -39,6 +39,8 @@ PLACEHOLDER = re.compile(r"\[|(?:^|:)(?:NAME|COMMAND|FIELD|BLOCK)\b|FIELD:|\.\.\
 """In a word of a command that cannot be given as it stands."""
 MOST_LINES = 80
 """Of README."""
+MOST_BYTES = 8_000
+"""Of the results, docs/measured.md: what else was measured is a note in bench/log."""
 
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=title)
@@ -231,3 +233,7 @@ def test_readme_is_short():
     assert len(text.splitlines()) <= MOST_LINES
     examples = next(block for block in code(ROOT / "README.md") if "recipe:surface" in block.text)
     assert len(examples.text.splitlines()) == 10
+
+
+def test_results_are_short():
+    assert len((ROOT / "docs" / "measured.md").read_bytes()) <= MOST_BYTES
