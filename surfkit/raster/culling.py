@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import CUTOFF, Splats
+from surfkit.raster.api import CUTOFF, SplatBoxes, Splats
 from surfkit.scene.camera import Camera
 
 SPLAT_MARGIN_PX = 3.0
@@ -40,6 +40,45 @@ def may_touch(splats: Splats, camera: Camera, near: float) -> Tensor:
     planes = planes.to(pose)
     beyond = torch.addmm(planes @ pose[:3, 3], splats.means, (planes @ pose[:3, :3]).T)
     return (beyond[:, :4] <= reach[:, None]).all(1) & (beyond[:, 4] > (1 - BOUND_ROUNDING) * near)
+
+
+def boxes_may_touch(boxes: SplatBoxes, camera: Camera, near: float) -> Tensor:
+    """(B,) bool: False for boxes of which no splat may touch a pixel (`may_touch`).
+
+    A splat passes `may_touch` if its mean is no farther beyond each of some planes than its reach times a factor. The
+    means of a box are at most its support beyond a plane, and the reach of its splats is that of the largest.
+    """
+    pose = camera.world_to_camera.to(boxes.low)
+    planes, share = _planes(boxes, camera)
+    planes = torch.tensor([*planes, [0.0, 0.0, -1.0]]).to(pose)  # the last: how far before the camera
+    normals, offsets = planes @ pose[:3, :3], planes @ pose[:3, 3]
+    middle, half = (boxes.low + boxes.high) / 2, (boxes.high - boxes.low) / 2
+    nearest = torch.addmm(offsets, middle, normals.T) - half @ normals.abs().T  # of any mean of the box
+    reach = boxes.scale * (CUTOFF * (1 + 2 * BOUND_ROUNDING))
+    rounding = BOUND_ROUNDING * (half.norm(dim=1) + reach)  # float32 at coordinates far larger than the box
+    rounding = rounding + 1e-5 * torch.maximum(boxes.low.abs(), boxes.high.abs()).amax(1) + 1e-5 * offsets.abs().max()
+    beyond = nearest[:, :4] <= (share.to(pose) * reach[:, None]) + rounding[:, None]
+    return beyond.all(1) & (-nearest[:, 4] > (1 - 2 * BOUND_ROUNDING) * near - rounding)
+
+
+def _planes(boxes: SplatBoxes, camera: Camera) -> tuple[list[list[float]], Tensor]:
+    """Unit normals of the planes through the camera beside the image, pointing away, camera frame; (4,) the share of
+    the reach that counts at each."""
+    sides = ((camera.fx, camera.cx, camera.width, 0), (camera.fy, camera.cy, camera.height, 1))
+    is_blurred = boxes.kind == "gaussian" and boxes.geometry != "ray"
+    margin = SPLAT_MARGIN_PX + (CUTOFF * math.sqrt(boxes.dilation) if is_blurred else 0.0)
+    normals, shares = [], []
+    for focal, principal, pixels, axis in sides:
+        edge = HELD_SLOPE_SHARE * pixels / focal
+        slope = max(abs(principal / focal + edge), abs((pixels - principal) / focal + edge))
+        stretch = focal * math.sqrt(1 + slope**2) if is_blurred else 0.0
+        for across, ahead in ((-focal, -margin - principal), (focal, principal - pixels - margin)):
+            length = math.hypot(across, ahead)
+            normal = [0.0, 0.0, ahead / length]
+            normal[axis] = across / length
+            normals.append(normal)
+            shares.append(stretch / length if is_blurred else 1.0)
+    return normals, torch.tensor(shares)
 
 
 def _blurred(splats: Splats, centre: Tensor, reach: Tensor, camera: Camera, near: float) -> Tensor:

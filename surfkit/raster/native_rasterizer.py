@@ -11,7 +11,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.culling import boxes_may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -48,6 +49,10 @@ class NativeRasterizer(Rasterizer):
             torch.get_num_threads(),
         )
         return found.to(splats.means.device)
+
+    def boxes_in_view(self, boxes: SplatBoxes, camera: Camera, near: float) -> Tensor | None:
+        """See `Rasterizer.boxes_in_view`."""
+        return boxes_may_touch(boxes, camera, near)
 
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from surfkit.densify.base import Policy, Step
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.points import Points
+from surfkit.raster.api import Splats
 from surfkit.train.in_view import with_frozen
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
@@ -26,7 +28,7 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     )
     signed_norm = among_all(lengths(gradients.signal))
     camera = result.target.view.camera
-    drawn = result.splats if in_view is None else with_frozen(setup, state, in_view.splats, 0)
+    drawn = result.splats if in_view is None else with_frozen(setup, state, all_splats(setup, state), 0)
     return Step(
         index=index,
         steps=stage.steps,
@@ -37,12 +39,24 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
         image_px=max(camera.width, camera.height),
         views=ViewContributions(setup.views, setup.draws, drawn, stage.near, len(state.points)),
         since_reset=index - state.reset_at,
-        rates={n: rate.at(index, stage.steps) / 2**state.halvings for n, rate in setup.rates.items()},
+        rates=rates_at(setup, state),
         seed=state.seed,
         owns=setup.owns,
         signed_norm=signed_norm,
         derived=gradients.derived and gradients.derived.combined(stage.signal.combine),
     )
+
+
+def rates_at(setup: StageSetup, state: StageState) -> dict[str, float]:
+    """The learning rate of each parameter in the coming step."""
+    at = state.index + 1, setup.stage.steps
+    return {name: rate.at(*at) / 2**state.halvings for name, rate in setup.rates.items()}
+
+
+@torch.no_grad()
+def all_splats(setup: StageSetup, state: StageState) -> Splats:
+    """All N splats, detached, in the colours of degree 0."""
+    return setup.primitive.activate(state.points.params, 0)
 
 
 def wanted(policies: Sequence[Policy], points: Points, step: Step) -> Edit | None:

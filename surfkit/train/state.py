@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from surfkit.primitives.points import Columns, Points
+from surfkit.train.point_blocks import PointBlocks
 from surfkit.train.view_order import ViewOrder
 
 
@@ -39,6 +40,8 @@ class StageState:
     """Positions of photographs that turned out damaged, and are not shown any more."""
     whole: bool = True
     """Whether it is that after a step, and not one in which a step has changed a part."""
+    blocks: PointBlocks | None = None
+    """Bounds of blocks of points, for steps that look only into some; made anew where they are not of these points."""
     frozen: Columns = field(default_factory=dict)
     """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
 

@@ -16,10 +16,11 @@ from surfkit.primitives.edit import Edit, apply, fitted, observe
 from surfkit.train.adam import adam_step
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
-from surfkit.train.in_view import PointsInView, with_frozen
+from surfkit.train.in_view import PointsInView, note_moved, with_frozen
 from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
 from surfkit.train.next_view import neighbour, next_target
-from surfkit.train.policies import told, wanted
+from surfkit.train.point_blocks import put_in_order
+from surfkit.train.policies import rates_at, told, wanted
 from surfkit.train.required_maps import GEOMETRY_MAPS, maps_of_step
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
@@ -64,16 +65,19 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
-    step = told(setup, state, result)
-    edit = wanted(stage.policies, state.points, step)  # policies look at the points as they were drawn
+    edit = None  # policies look at the points as they were drawn
+    if stage.policies:
+        edit = wanted(stage.policies, state.points, told(setup, state, result))
     grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()))
     if in_view is not None:
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
         result.appearance.learn()
-    adam_step(state.points, grads, step.rates, index, None if in_view is None else in_view.rows)
+    adam_step(state.points, grads, rates_at(setup, state), index, None if in_view is None else in_view.rows)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
+    else:
+        note_moved(setup, state, in_view)
     state.points = fitted(setup.primitive, state.points)
     return edit
 
@@ -86,6 +90,8 @@ def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
     points = apply(setup.primitive, state.points, edit, state.generator)
     if len(points) == 0:
         raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
+    if setup.stage.update == "in-view":
+        put_in_order(points)
     state.points = observe(setup.primitive, points, setup.views, setup.stage.near)
     if edit.max_opacity is not None:
         state.reset_at = index

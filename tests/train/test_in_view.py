@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
+from needs import needs_native
 
 from surfkit.densify import ADC, Trim
 from surfkit.densify.base import Prune
@@ -12,10 +13,12 @@ from surfkit.losses.regularizers import MeanOpacity
 from surfkit.losses.reprojection import Reprojection
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
-from surfkit.train import checkpoint
+from surfkit.raster.native_rasterizer import NativeRasterizer
+from surfkit.train import checkpoint, in_view, point_blocks
 from surfkit.train.adam import UPDATED
 from surfkit.train.faults import Diverged
 from surfkit.train.in_view import PointsInView
+from surfkit.train.point_blocks import put_in_order
 from surfkit.train.stage import Stage
 
 from .conftest import looking_down
@@ -44,6 +47,7 @@ def apart(begin):
         params["scales"] = params["scales"] - 0.5
         cameras = [looking_down(x, y) for x in (-0.7, 0.0, 0.7) for y in (-0.4, 0.4)]
         views = tuple(replace(view, camera=camera) for view, camera in zip(trainer.views, cameras, strict=True))
+        put_in_order(state.points)  # as the first step does
         return replace(trainer, views=views), state
 
     return start
@@ -113,6 +117,7 @@ def test_steps_that_need_all_points_update_all(apart, change):
 def test_a_view_that_shows_no_point(begin):
     trainer, state = begin(replace(QUIET, losses={"l1": L1()}))
     state.points.params["means"] = state.points.params["means"] + 100
+    put_in_order(state.points)
     before = held(state.points)
     done = list(trainer.run(state))
     assert all(step.losses["l1"] > 0 for step in done)
@@ -164,8 +169,10 @@ def test_frozen_points_teach_the_others_the_same(apart):
     note = Noted()
     replace(trainer, stage=replace(trainer.stage, prune=(note,))).step(part)
     trainer.step(whole)
+    kept = whole.points.take(~rows)
+    put_in_order(kept)  # which is that of other points when others are among them
     for name, value in part.points.params.items():
-        assert torch.equal(value, whole.points.params[name][~rows]), name
+        assert torch.equal(value, kept.params[name]), name
     assert len(note.steps[0].splats) == 25 and len(note.steps[0].views.contributions().mean) == 25
 
 
@@ -179,7 +186,54 @@ class Steep(L1):
 
 def test_gradients_that_are_too_large_name_step_and_view(begin):
     trainer, state = begin(replace(QUIET, losses={"l1": Steep()}))
+    put_in_order(state.points)
     before = held(state.points)
     with pytest.raises(Diverged, match=r"step 1, view \d.png: the gradients of the .* are not finite, or too large"):
         trainer.step(state)
     assert all(torch.equal(value, before[name]) for name, value in state.points.params.items())
+
+
+@dataclass(frozen=True)
+class WithoutBoxes(NativeRasterizer):
+    """Looks at every point."""
+
+    def boxes_in_view(self, boxes, camera, near):
+        return None
+
+
+@needs_native
+@pytest.mark.parametrize("primitive", [Surfel2D(1), Gaussian3D(1)], ids=lambda part: type(part).__name__)
+def test_blocks_that_no_view_shows_make_no_difference(apart, primitive, monkeypatch):
+    """The same bits, with blocks of 4 points, edits, and points that are put in order on the way."""
+    monkeypatch.setattr(point_blocks, "BLOCK_POINTS", 4)
+    monkeypatch.setattr(in_view, "SORTED_EVERY", 5)
+    stage = replace(QUIET, steps=14, densify=ADC(start=2, every=4, threshold=1e-7, until=12), sh_every=4)
+    ends, opened = [], []
+    for rasterizer in (NativeRasterizer(), WithoutBoxes()):
+        trainer, state = apart(stage, primitive)
+        trainer = replace(trainer, rasterizer=rasterizer)
+        for done in trainer.run(state):
+            shown = rasterizer.boxes_in_view(state.blocks.boxes, done.target.view.camera, stage.near)
+            opened += [] if shown is None else [float(shown.float().mean())]
+        ends.append(state.points)
+    assert min(opened) < 0.7, "some blocks are never opened"
+    assert len(ends[0]) > 40 and len(ends[0]) == len(ends[1]), "points were added"
+    for group in ("params", "exp_avg", "exp_avg_sq", "stats"):
+        for name, value in getattr(ends[0], group).items():
+            assert torch.equal(value, getattr(ends[1], group)[name]), (group, name)
+
+
+def test_points_in_order_are_the_same_points(apart):
+    trainer, state = apart(QUIET)
+    for _ in range(3):
+        trainer.step(state)
+    before = state.points.take(torch.randperm(len(state.points), generator=torch.Generator().manual_seed(1)))
+    after = before.take(torch.arange(len(before)))
+    put_in_order(after)
+    where = (after.params["means"][:, None] == before.params["means"]).all(2).nonzero()[:, 1]
+    assert sorted(where.tolist()) == list(range(len(before))) and where.tolist() != sorted(where.tolist())
+    for group in ("params", "exp_avg", "exp_avg_sq", "stats"):
+        for name, value in getattr(after, group).items():
+            assert torch.equal(value, getattr(before, group)[name][where]), (group, name)
+    apart_before, apart_after = (points.params["means"].diff(dim=0).norm(dim=1).mean() for points in (before, after))
+    assert apart_after < 0.6 * apart_before

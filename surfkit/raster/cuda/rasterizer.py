@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.culling import may_touch
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.culling import boxes_may_touch, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
 from surfkit.raster.validate import validate
@@ -275,6 +275,10 @@ class TileRasterizer(Rasterizer):
     def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
         """See `Rasterizer.in_view`."""
         return may_touch(splats, camera, near)
+
+    def boxes_in_view(self, boxes: SplatBoxes, camera: Camera, near: float) -> Tensor | None:
+        """See `Rasterizer.boxes_in_view`."""
+        return boxes_may_touch(boxes, camera, near)
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = self._pass(_grey(splats), camera, near, rim=0.0)

@@ -1,0 +1,116 @@
+"""What a step costs as a survey grows: `python bench/growth.py --photographs 2000 8000`.
+
+Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
+many points in each view whatever the number of photographs. For each survey and each way to update, a process of its
+own takes steps of 2DGS without densification, spread over all of the photographs: the median CPU time of a step, all
+threads, and the peak of the memory. Points are made at once, not read; photographs are noise, made when they are asked
+for, so that neither files nor the cache count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from machine import save
+from torch import Tensor
+
+from surfkit.core.memory import peak_memory_bytes
+from surfkit.primitives.points import Points
+from surfkit.raster.select import select
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import SparsePoints, View
+from surfkit.study.recipes import SURFELS
+from surfkit.train.trainer import Trainer
+
+POINTS_PER_PHOTOGRAPH = 198
+WIDTH, HEIGHT, FOCAL_PX = 160, 120, 140.0
+APART = 0.22
+"""Distance of neighbouring cameras, as a share of their height."""
+
+
+@dataclass(frozen=True)
+class Noise(Sequence[Tensor]):
+    """Photographs that are made when they are asked for."""
+
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, at: int) -> Tensor:  # type: ignore[override]
+        draw = torch.Generator().manual_seed(at)
+        return torch.randint(0, 256, (3, HEIGHT, WIDTH), generator=draw, dtype=torch.uint8)
+
+
+def survey(photographs: int) -> tuple[tuple[View, ...], SparsePoints]:
+    """Cameras that look down, and points on the ground, in a frame whose extent is about 1."""
+    across = math.ceil(math.sqrt(photographs))
+    height = 2 / (across * APART)
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    views = []
+    for at in range(photographs):
+        x, y = ((k + 0.5) * APART * height - 1 for k in divmod(at, across))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ torch.tensor([x, y, height], dtype=torch.float64)
+        camera = Camera(pose, FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+        views.append(View(f"{at}.png", camera, Path(f"{at}.png")))
+    count, draw = POINTS_PER_PHOTOGRAPH * photographs, torch.Generator().manual_seed(0)
+    xyz = torch.rand(count, 3, generator=draw) * torch.tensor([2.0, 2.0, 0.02 * height]) - torch.tensor([1.0, 1.0, 0.0])
+    rgb = torch.randint(0, 256, (count, 3), generator=draw, dtype=torch.uint8)
+    return tuple(views), SparsePoints(xyz, rgb, size=torch.full((count,), 0.5 * 2 / math.sqrt(count)))
+
+
+def measured(photographs: int, update: str, steps: int) -> dict[str, float]:
+    """Median CPU milliseconds of a step, and the peak of this process."""
+    views, cloud = survey(photographs)
+    stage = replace(SURFELS.pretrain, steps=30_000, densify=None, update=update)
+    rasterizer, _ = select("cpu")
+    trainer = Trainer(stage, SURFELS.primitive, views, Noise(photographs), rasterizer)
+    generator = torch.Generator().manual_seed(0)
+    state = trainer.begin(Points.fresh(SURFELS.primitive.init(cloud, generator)), generator)
+    times, seen = [], []
+    for index in range(steps + 5):
+        began = time.process_time()
+        done = trainer.step(state)
+        times += [1e3 * (time.process_time() - began)] * (index >= 5)
+        seen.append(float(done.maps.need("alpha").mean()))
+    return {
+        "ms": sorted(times)[len(times) // 2],
+        "mean_ms": sum(times) / len(times),
+        "points": len(state.points),
+        "peak_gb": peak_memory_bytes() / 1e9,
+        "alpha": sum(seen) / len(seen),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photographs", type=int, nargs="+", default=[2000, 8000])
+    parser.add_argument("--updates", nargs="+", default=["all", "in-view"])
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        print(json.dumps(measured(given.photographs[0], given.updates[0], given.steps)))
+        return
+    figures = {}
+    for update in given.updates:
+        for photographs in given.photographs:
+            words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--updates", update]
+            said = subprocess.run([*words, "--steps", str(given.steps)], stdout=subprocess.PIPE, text=True, check=True)
+            figures[f"{update} {photographs}"] = found = json.loads(said.stdout)
+            print(update, photographs, *(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
+    print(f"wrote {save('growth', figures)}")
+
+
+if __name__ == "__main__":
+    main()
