@@ -305,6 +305,13 @@ class SplatBoxes:
         low, high, scale = (torch.cat([getattr(part, name) for part in parts]) for name in ("low", "high", "scale"))
         return replace(parts[0], low=low, high=high, scale=scale)
 
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def take(self, rows: Tensor) -> SplatBoxes:
+        """Those of (K,) indices."""
+        return replace(self, low=self.low[rows], high=self.high[rows], scale=self.scale[rows])
+
     def widen(self, blocks: Tensor, splats: Splats) -> None:
         """Take in R splats, each into the box of its block, (R,) int64."""
         means, into = splats.means.detach().float(), blocks[:, None].expand(-1, 3)

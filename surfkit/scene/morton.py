@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 
-def morton_order(means: np.ndarray) -> np.ndarray:
-    """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another."""
+def morton_order(means: np.ndarray, cubes: bool = False) -> np.ndarray:
+    """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another.
+
+    Each axis is divided alike, whatever its extent; with `cubes`, into the same lengths, so that points of flat ground
+    are not sorted by their heights.
+    """
     if not len(means):
         return np.zeros(0, np.int64)
     low, high = means.min(0), means.max(0)
-    cells = ((means - low) / np.where(high > low, high - low, 1) * (2**21 - 1)).astype(np.uint64)
+    extent = np.full(3, (high - low).max(), means.dtype) if cubes else high - low
+    cells = ((means - low) / np.where(extent > 0, extent, 1) * (2**21 - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
     for axis in range(3):
         code |= _spread(cells[:, axis]) << np.uint64(axis)

@@ -15,58 +15,66 @@ from surfkit.scene.morton import morton_order
 
 BLOCK_POINTS = 256
 """Points of a block: those of the rows 256 k to 256 (k + 1)."""
+GROUP_BLOCKS = 32
+"""Blocks that are looked at together first."""
 SORTED_EVERY = 1_000
 """Steps after which points are put in spatial order again; they are after each edit, too."""
 ACTIVATED_AT_ONCE = 2**18
-"""Points that are activated together where bounds are made of all."""
+"""Points that are activated together where bounds are made of all; whole groups of blocks."""
 
 
 @dataclass
 class PointBlocks:
-    """Bounds of each block, which hold all of its points: they are widened as points move, and made anew in time.
+    """Bounds of blocks of points, and of groups of blocks: they are widened as points move, and made anew in time.
 
     Attributes:
-        boxes: B of them.
+        blocks: Boxes of B blocks.
+        groups: Of each `GROUP_BLOCKS` of them.
         columns: The parameters that they are of; where others have taken their place, they are of no use.
     """
 
-    boxes: SplatBoxes
+    blocks: SplatBoxes
+    groups: SplatBoxes
     columns: Columns
 
     @classmethod
     @torch.no_grad()
     def of(cls, primitive: Primitive, params: Columns) -> PointBlocks:
         """The blocks of N points, activated some at a time."""
-        count = len(params["means"])
-        parts = []
-        for begin in range(0, count, ACTIVATED_AT_ONCE):
+        sizes, parts = (BLOCK_POINTS, BLOCK_POINTS * GROUP_BLOCKS), []
+        for begin in range(0, len(params["means"]), ACTIVATED_AT_ONCE):
             some = {name: value[begin : begin + ACTIVATED_AT_ONCE] for name, value in params.items()}
-            parts.append(SplatBoxes.of(primitive.activate(some, 0), BLOCK_POINTS))
-        return cls(SplatBoxes.joined(parts), dict(params))
+            splats = primitive.activate(some, 0)
+            parts.append([SplatBoxes.of(splats, size) for size in sizes])
+        return cls(*(SplatBoxes.joined(boxes) for boxes in zip(*parts, strict=True)), dict(params))
 
     def are_of(self, params: Columns) -> bool:
         """Whether these are the parameters whose bounds are known."""
-        return params.keys() == self.columns.keys() and all(
-            params[name] is value for name, value in self.columns.items()
-        )
+        known = self.columns
+        return params.keys() == known.keys() and all(params[name] is value for name, value in known.items())
 
     def rows(self, rasterizer: Rasterizer, camera: Camera, near: float) -> Tensor | None:
         """(C,) int64 in their order: the points of all blocks that a view may show; None where all blocks are.
 
         What `Rasterizer.in_view` tells of these is what it tells of all.
         """
-        shown = rasterizer.boxes_in_view(self.boxes, camera, near)
+        shown = rasterizer.boxes_in_view(self.groups, camera, near)
         if shown is None:
             return None
-        blocks = shown.nonzero()[:, 0]
-        rows = blocks[:, None] * BLOCK_POINTS + torch.arange(BLOCK_POINTS, device=blocks.device)
-        rows = rows.flatten()
-        count = len(self.columns["means"])
-        return rows[rows < count] if len(blocks) and int(rows[-1]) >= count else rows
+        blocks = _members(shown.nonzero()[:, 0], GROUP_BLOCKS, len(self.blocks))
+        shown = rasterizer.boxes_in_view(self.blocks.take(blocks), camera, near)
+        return _members(blocks if shown is None else blocks[shown], BLOCK_POINTS, len(self.columns["means"]))
 
     def widen(self, rows: Tensor, splats: Splats) -> None:
         """Take in R points, (R,) rows, as they are now."""
-        self.boxes.widen(rows // BLOCK_POINTS, splats)
+        self.blocks.widen(rows // BLOCK_POINTS, splats)
+        self.groups.widen(rows // (BLOCK_POINTS * GROUP_BLOCKS), splats)
+
+
+def _members(groups: Tensor, size: int, count: int) -> Tensor:
+    """(M,) what is in (G,) groups of `size` each, in their order; the last group of `count` may not be full."""
+    members = (groups[:, None] * size + torch.arange(size, device=groups.device)).flatten()
+    return members[members < count]
 
 
 @torch.no_grad()
@@ -75,9 +83,8 @@ def put_in_order(points: Points) -> None:
 
     One column after the other is copied, so that no more than one stands twice.
     """
-    order = torch.from_numpy(morton_order(points.params["means"].detach().cpu().numpy())).to(
-        points.params["means"].device
-    )
+    means = points.params["means"].detach()
+    order = torch.from_numpy(morton_order(means.cpu().numpy(), cubes=True)).to(means.device)
     for group in (points.params, points.exp_avg, points.exp_avg_sq, points.stats):
         for name in group:
             if name not in points.shared:

@@ -206,9 +206,10 @@ class WithoutBoxes(NativeRasterizer):
 @pytest.mark.parametrize("primitive", [Surfel2D(1), Gaussian3D(1)], ids=lambda part: type(part).__name__)
 @pytest.mark.parametrize("edited", [True, False])
 def test_blocks_that_no_view_shows_make_no_difference(apart, primitive, edited, monkeypatch):
-    """The same bits, with blocks of 4 points, and with edits and points that are put in order on the way, or with points
-    that fly out of the boxes of the begin."""
+    """The same bits, with blocks of 4 points, and with edits and points that are put in order on the way, or with
+    points that fly out of the boxes of the begin."""
     monkeypatch.setattr(point_blocks, "BLOCK_POINTS", 4)
+    monkeypatch.setattr(point_blocks, "GROUP_BLOCKS", 2)
     monkeypatch.setattr(in_view, "SORTED_EVERY", 5 if edited else 100)
     stage = replace(QUIET, steps=14, sh_every=4, rates={"means": LearningRate(1e-3 if edited else 0.1)})
     if edited:
@@ -218,7 +219,7 @@ def test_blocks_that_no_view_shows_make_no_difference(apart, primitive, edited, 
         trainer, state = apart(stage, primitive)
         trainer = replace(trainer, rasterizer=rasterizer)
         for done in trainer.run(state):
-            shown = rasterizer.boxes_in_view(state.blocks.boxes, done.target.view.camera, stage.near)
+            shown = rasterizer.boxes_in_view(state.blocks.blocks, done.target.view.camera, stage.near)
             opened += [] if shown is None else [float(shown.float().mean())]
         ends.append(state.points)
     assert min(opened) < (0.7 if edited else 1), "some blocks are not opened"
