@@ -73,7 +73,7 @@ from surfkit.primitives.init import SH_C0, facing, seeds
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
@@ -204,6 +204,7 @@ __all__ = [
     "Observations2D",
     "RawImage",
     "Signal",
+    "SplatBoxes",
     "SplatModel",
     "SplatTable",
     "Splats",

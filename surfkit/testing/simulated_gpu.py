@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.nvrtc import modules
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.scene.camera import Camera
@@ -253,6 +253,11 @@ class OnSimulatedGpu(Rasterizer):
 
     def in_view(self, splats: Splats, camera: Camera, near: float) -> torch.Tensor:
         return self.inner.in_view(_here(splats), camera, near).to(splats.means.device)
+
+    def boxes_in_view(self, boxes: SplatBoxes, camera: Camera, near: float) -> torch.Tensor | None:
+        here = replace(boxes, low=boxes.low.cpu(), high=boxes.high.cpu(), scale=boxes.scale.cpu())
+        found = self.inner.boxes_in_view(here, camera, near)
+        return None if found is None else found.to(boxes.low.device)
 
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float

@@ -58,12 +58,16 @@ class PointBlocks:
 
         What `Rasterizer.in_view` tells of these is what it tells of all.
         """
+        count = len(self.columns["means"])
+        if self.blocks.low.device.type != "cpu":  # a GPU looks at all blocks sooner than the host hears of some
+            shown = rasterizer.boxes_in_view(self.blocks, camera, near)
+            return None if shown is None else shown.repeat_interleave(BLOCK_POINTS)[:count].nonzero()[:, 0]
         shown = rasterizer.boxes_in_view(self.groups, camera, near)
         if shown is None:
             return None
         blocks = _members(shown.nonzero()[:, 0], GROUP_BLOCKS, len(self.blocks))
         shown = rasterizer.boxes_in_view(self.blocks.take(blocks), camera, near)
-        return _members(blocks if shown is None else blocks[shown], BLOCK_POINTS, len(self.columns["means"]))
+        return _members(blocks if shown is None else blocks[shown], BLOCK_POINTS, count)
 
     def widen(self, rows: Tensor, splats: Splats) -> None:
         """Take in R points, (R,) rows, as they are now."""

@@ -94,8 +94,8 @@ def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path, update)
     assert torch.equal(loaded.points.params["means"], there.points.params["means"])
     waits = {name: count for name, count in gpu.waits.items() if name != "to cpu"}  # those are the rasterizer's
     assert waits.pop("tolist") == 2 * 20, "a step waits once for its losses and once for whether all is finite"
-    in_view = 20 if update == "in-view" else 0
-    assert waits.get("nonzero", 0) >= in_view, "a step waits for the number of points in view"
+    in_view = 2 * 20 if update == "in-view" else 0
+    assert waits.get("nonzero", 0) >= in_view, "a step waits for how many points are in blocks in view, and in view"
     assert sum(waits.values()) < 60 + in_view, "edits wait for the numbers of their points, steps do not"
 
 
