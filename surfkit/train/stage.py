@@ -60,8 +60,8 @@ class Stage:
     update: Literal["all", "in-view"] = "all"
     """Points that a step updates: all, of which those out of view move on by momentum, as in 3DGS, or only those in
     view: a step then costs what its view shows, whatever the size of the scene (but for what policies look at). Stages
-    with regularizers, steps with a second view, and primitives that draw themselves or have parameters that belong to no
-    point always update all."""
+    with regularizers, steps with a second view, and primitives that draw themselves or have parameters that belong to
+    no point always update all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_STAGE_STEPS:
