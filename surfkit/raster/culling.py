@@ -49,8 +49,8 @@ def boxes_may_touch(boxes: SplatBoxes, camera: Camera, near: float) -> Tensor:
     means of a box are at most its support beyond a plane, and the reach of its splats is that of the largest.
     """
     pose = camera.world_to_camera.to(boxes.low)
-    planes, share = _planes(boxes, camera)
-    planes = torch.tensor([*planes, [0.0, 0.0, -1.0]]).to(pose)  # the last: how far before the camera
+    sides, share = _planes(boxes, camera)
+    planes = torch.tensor([*sides, [0.0, 0.0, -1.0]]).to(pose)  # the last: how far before the camera
     normals, offsets = planes @ pose[:3, :3], planes @ pose[:3, 3]
     middle, half = (boxes.low + boxes.high) / 2, (boxes.high - boxes.low) / 2
     nearest = torch.addmm(offsets, middle, normals.T) - half @ normals.abs().T  # of any mean of the box

@@ -41,12 +41,13 @@ class PointBlocks:
     @torch.no_grad()
     def of(cls, primitive: Primitive, params: Columns) -> PointBlocks:
         """The blocks of N points, activated some at a time."""
-        sizes, parts = (BLOCK_POINTS, BLOCK_POINTS * GROUP_BLOCKS), []
+        blocks, groups = [], []
         for begin in range(0, len(params["means"]), ACTIVATED_AT_ONCE):
             some = {name: value[begin : begin + ACTIVATED_AT_ONCE] for name, value in params.items()}
             splats = primitive.activate(some, 0)
-            parts.append([SplatBoxes.of(splats, size) for size in sizes])
-        return cls(*(SplatBoxes.joined(boxes) for boxes in zip(*parts, strict=True)), dict(params))
+            blocks.append(SplatBoxes.of(splats, BLOCK_POINTS))
+            groups.append(SplatBoxes.of(splats, BLOCK_POINTS * GROUP_BLOCKS))
+        return cls(SplatBoxes.joined(blocks), SplatBoxes.joined(groups), dict(params))
 
     def are_of(self, params: Columns) -> bool:
         """Whether these are the parameters whose bounds are known."""
