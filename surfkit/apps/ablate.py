@@ -170,7 +170,7 @@ def truths(paths: Sequence[Path], taus: Sequence[float]) -> tuple[Truth, ...]:
         raise BadInput(f"{given}: it needs --gt; add --gt, or leave it out")
     if len(taus) not in (0, 1, len(paths)):
         raise BadInput(f"{given}: {len(taus)} thresholds for {len(paths)} ground truths; give one for each, or one")
-    every = [*taus] * len(paths) if len(taus) == 1 else taus or [None] * len(paths)
+    every: Sequence[float | None] = [*taus] * len(paths) if len(taus) == 1 else taus or [None] * len(paths)
     return tuple(Truth(path, tau) for path, tau in zip(paths, every, strict=True))
 
 

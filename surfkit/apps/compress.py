@@ -99,7 +99,7 @@ class CompressCommand:
                 other = None if wanted.is_set or self._is_named else other_of(self.compress)
                 size = None if other is None else size_with(ctx, made, other)
         show(run, record, metrics)
-        if size is not None:
+        if other is not None and size is not None:
             share = record["bytes"] / size
             compared = f"{share:.1f} times smaller" if share > 1 else f"{1 / share:.1f} times larger"
             print(f"\nWith compress:{name_of(other)} it would be about {size / 1e6:.2f} MB, {compared}.")

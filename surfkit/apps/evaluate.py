@@ -158,6 +158,7 @@ class EvaluateCommand:
         if surface is not None:
             metrics = note_metrics(run.metrics, mesh_alone(surface, scene))
         if zones != Zones():
+            assert made.draw is not None, "a run that draws nothing is refused"
             found = measure_zones(scene, made.draw, zones, rendered_depths(made.draw), seams)
             metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
         if tree is not None:
@@ -188,11 +189,11 @@ class EvaluateCommand:
         if run is None and zones != Zones():
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
         shown = replace(run, out=run.compressed) if run is not None and self.compressed else run
-        if run is not None:
+        if shown is not None:
             refuse_no_mesh(shown)
-            if zones != Zones():
-                refuse_not_drawn(run)
-        out = self._beside() if run is None else self.out or shown.out
+        if run is not None and zones != Zones():
+            refuse_not_drawn(run)
+        out = self._beside() if shown is None else self.out or shown.out
         refuse_unwritable(out / "geometry")
         scene = self._scene(run)
         if scene is not None:
@@ -200,9 +201,12 @@ class EvaluateCommand:
         surface = read_surface(truth) if self.seen else None
         if surface is not None and surface.faces is None:
             raise BadInput(f"{truth}: a cloud of points; --seen needs a mesh, or leave --gt out to use rendered depth")
-        seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
+        seams = None
+        if self.seams is not None:
+            assert run is not None and scene is not None, "--seams of a file is refused"
+            seams = seams_of(run, scene.frame, self.seams)
         measured = measure_geometry(
-            (self.target if run is None else shown.mesh, truth),
+            (self.target if shown is None else shown.mesh, truth),
             self.geometry,
             out / "geometry",
             scene.train if scene else (),
@@ -211,11 +215,11 @@ class EvaluateCommand:
         )
         found = measured["geometry"]
         metrics, images = note_metrics(out / "metrics.json", measured), {}
-        if zones != Zones() and scene.held_out:
+        if scene is not None and scene.held_out and zones != Zones():
             images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
             before = metrics.get("images")
             note_metrics(out / "metrics.json", {"images": (before if isinstance(before, dict) else {}) | images})
-        if self.compressed:
+        if run is not None and self.compressed:
             note_compressed(run, metrics)
         show_geometry(out, measured, images)
 
@@ -223,6 +227,7 @@ class EvaluateCommand:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
         with locked(self.target), full_disk_in_one_line(self.target):
             with loaded(self.target, self.device) as (ctx, made):
+                assert made.draw is not None, "a run that draws nothing is refused"
                 run, scene = ctx.run, ctx.scene
                 depths = rendered_depths(made.draw) if truth is None else true_depths(truth, scene.frame, matrix)
                 seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)

@@ -104,9 +104,11 @@ class ExportCommand:
             tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
-        if self.geoid is not None:
+        if isinstance(self.format, Tiles3D) and self.geoid is not None:
             return replace(self.format, geoid=self.geoid)
-        return replace(self.format, strict_2dgs=True) if self.strict_2dgs else self.format
+        if isinstance(self.format, PLY) and self.strict_2dgs:
+            return replace(self.format, strict_2dgs=True)
+        return self.format
 
     def _path(self) -> Path:
         """Where to write; BadInput for a place that the format cannot have."""

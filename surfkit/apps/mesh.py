@@ -90,9 +90,10 @@ class MeshCommand:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             mesher = None if made.mesh is not None else self.mesh
             maps = nullcontext(run) if mesher is None else with_maps_to_mesh(run, mesher, scene, caches, self.device)
+            subject = self.mesh if made.mesh is None else made.mesh
             with locked(run.out), full_disk_in_one_line(run.out), maps as run, record_events(run.out):
                 what = mesh_input(run, made, scene, ctx.rasterizer, budget, mesher)
-                record = make_mesh(run, mesher or made.mesh, self.delivery, what, made.last_steps)
+                record = make_mesh(run, subject, self.delivery, what, made.last_steps)
             note_held_out(run, scene)
         show(run, record)
 

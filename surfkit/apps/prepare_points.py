@@ -90,11 +90,12 @@ class PreparePointsCommand:
 
     def run(self) -> None:
         """Triangulate, and print the results."""
-        given = {"layout": self.layout, "images": self.images, "masks": self.masks, "alpha": self.alpha}
-        data, scene = Data(self.data, **given), self.scene
-        way = "auto" if self.pairs == "poses" else "exhaustive"
+        data = Data(self.data, layout=self.layout, images=self.images, masks=self.masks, alpha=self.alpha)
+        scene = self.scene
         names = ("longest", "max_features", "features", "matcher", "neighbours", "seed")
-        settings = Settings(pairs=way, **{name: getattr(self, name) for name in names})
+        settings = Settings(
+            pairs="auto" if self.pairs == "poses" else "exhaustive", **{name: getattr(self, name) for name in names}
+        )
         if self.device != "auto" and not settings.in_torch:
             raise BadInput(
                 f"--device {self.device} is for features and matchers in torch, and there are none; add "

@@ -261,9 +261,10 @@ def zone_rows(images: dict[str, Any]) -> list[tuple[str, str]]:
     """What metrics.json says of parts of the held-out photographs."""
     seen, seams = images.get("seen"), images.get("seams")
     parts = [(f"PSNR seen by {number}+", one) for number, one in (seen["by_views"] if seen else {}).items()]
-    for name in ("near", "elsewhere") if seams else ():
-        where = f"within {seams['distance']} of block borders" if name == "near" else "elsewhere"
-        parts += [(f"PSNR {where}", seams[name])] if name in seams else []
+    for name in ("near", "elsewhere"):
+        if seams and name in seams:
+            where = f"within {seams['distance']} of block borders" if name == "near" else "elsewhere"
+            parts.append((f"PSNR {where}", seams[name]))
     return [
         (label, ("-" if one["psnr"] is None else f"{one['psnr']:.2f} dB") + f" over {one['share']:.1%} of the pixels")
         for label, one in parts

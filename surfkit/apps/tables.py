@@ -49,9 +49,9 @@ def rows_of(table: Table) -> list[tuple[str, str, str, str]]:
     found = []
     for row in table.rows:
         label = f"({row.label})" if row.is_given_up else row.label
-        before = recipes[below[row.label]] if below[row.label] else table.base
+        before = recipes[base] if (base := below[row.label]) else table.base
         after = replace(recipes[row.label], about=before.about)
         changes = [f"{path} = {json.dumps(value)}" for path, value in differences(dump(before), dump(after))]
         what = "a recipe of its own" if row.recipe else "; ".join(changes) or "nothing: the base"
-        found.append((numbers[row.label], label, numbers.get(below[row.label] or "", ""), what))
+        found.append((numbers[row.label], label, numbers.get(base or "", ""), what))
     return found

@@ -178,7 +178,7 @@ class TrainCommand:
             finally:
                 say("--view: the page ends with the run")
 
-    def _train(self, following: Callable[[Path], AbstractContextManager[None]] = nullcontext) -> None:
+    def _train(self, following: Callable[[Path], AbstractContextManager[object]] = nullcontext) -> None:
         path = self._with_cameras(self._data())
         out = self.out or Path("runs") / f"{path.resolve().name}-{self.folder}"
         data = self.reading.of(path, self._test_every(out))

@@ -112,9 +112,9 @@ class DoctorCommand:
                 diagnosis = replace(diagnosis, findings=(*diagnosis.findings, Finding("note", "forecast", text)))
             elif diagnosis.sound and self.probe:
                 plan = ProbePlan(self.probe, self.points, self.cache, self.device, self.out)
-                estimate, findings = forecast(data, recipe, examined, plan, report)
-                findings = tuple(sorted((*diagnosis.findings, *findings), key=lambda f: FINDING_LEVELS.index(f.level)))
-                diagnosis = replace(diagnosis, findings=findings, estimate=estimate)
+                estimate, more = forecast(data, recipe, examined, plan, report)
+                findings = sorted((*diagnosis.findings, *more), key=lambda f: FINDING_LEVELS.index(f.level))
+                diagnosis = replace(diagnosis, findings=tuple(findings), estimate=estimate)
         if self.json:
             print(as_json(diagnosis))
         else:

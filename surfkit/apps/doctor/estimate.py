@@ -169,15 +169,15 @@ def estimate(
         run_bytes=int(on_disk),
         data_bytes=int(load.undistort * load.undistort_bytes),
         room=room,
-        gpu=_on_gpu(load, rising, probed) if probed.started.gpu_free_bytes else None,
+        gpu=_on_gpu(load, rising, probed, free) if (free := probed.started.gpu_free_bytes) else None,
     )
 
 
-def _on_gpu(load: FixedCosts, rising: Growth, probed: ProbeResult) -> GpuEstimate:
+def _on_gpu(load: FixedCosts, rising: Growth, probed: ProbeResult, free: int) -> GpuEstimate:
     counts, peaks = (
         np.array(each, float) for each in zip(*((t.points, t.gpu_bytes) for t in probed.taken), strict=True)
     )
-    each, free = max(0.0, slope(counts, peaks)), probed.started.gpu_free_bytes
+    each = max(0.0, slope(counts, peaks))
     held = int(peaks.max() + each * max(0, rising.last - counts.max()))
     cached = min(load.view_bytes, int(GPU_SHARE * free))
     return GpuEstimate(held + cached, cached, each, free)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections import Counter
@@ -245,10 +244,11 @@ def _untied(gathered: Gathered) -> list[Finding]:
 
 def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:
     """Photographs that show the same places differently bright."""
-    names = [name for name, look in known.items() if look.brightness is not None and not look.flat]
+    bright = {name: look.brightness for name, look in known.items() if look.brightness is not None and not look.flat}
+    names = list(bright)
     if len(names) < 3:
         return []
-    stops = exposures(np.stack([known[name].brightness for name in names]))
+    stops = exposures(np.stack(list(bright.values())))
     if not np.isfinite(stops).any():
         return []
     low, high = np.nanpercentile(stops, [10, 90])
@@ -309,7 +309,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     whose = "as listed" if data.test_list is not None else whose
     whose = name_of(data.split) if data.split is not None else whose
     told = [f"train on {train} photographs, and measure on {held}" + (f" ({whose})" if held else "")]
-    sized = [(shot, known[shot.name].size) for shot in shots if shot.name in known and known[shot.name].size]
+    sized = [(shot, size) for shot in shots if shot.name in known and (size := known[shot.name].size) is not None]
     changes = {(size, size_to_read(data, shot, size)) for shot, size in sized}
     if smaller := sorted((a, b) for a, b in changes if a != b):
         (was, now), more = smaller[-1], f" (and {len(smaller) - 1} other sizes)" if len(smaller) > 1 else ""
@@ -332,7 +332,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     if not recipe.has_stages:
         return (*told, f"reconstruct with method:{name_of(recipe.method)}")
     sparse = len(gathered.capture.xyz)
-    pixels = sum(math.prod(view) for shot, size in sized for view in view_sizes(data, shot, size))
+    pixels = sum(width * height for shot, size in sized for width, height in view_sizes(data, shot, size))
     count = recipe.start.expected(sparse or RANDOM_POINTS, pixels)
     drawn = "" if sparse else f"; {RANDOM_POINTS:,} random points stand in for sparse ones"
     return (*told, f"start from about {count:,} points (start:{name_of(recipe.start)}{drawn})")

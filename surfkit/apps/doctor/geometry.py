@@ -165,7 +165,7 @@ def _poses(shots: Sequence[RawImage]) -> list[Finding]:
     distance = np.linalg.norm(centres - np.median(centres, 0), axis=1)
     usual = np.median(distance)
     found = []
-    far = [shots[at].name for at in np.argsort(-distance) if usual > 0 and distance[at] > FAR_CAMERA * usual]
+    far = [shots[at].name for at in np.argsort(-distance).tolist() if usual > 0 and distance[at] > FAR_CAMERA * usual]
     if far:
         times = distance.max() / usual
         text = (
@@ -175,7 +175,7 @@ def _poses(shots: Sequence[RawImage]) -> list[Finding]:
         found.append(Finding("warning", "far-cameras", text, tuple(far)))
     poses = np.stack([shot.pose for shot in shots]).reshape(len(shots), -1)
     _, at, back, count = np.unique(poses, axis=0, return_index=True, return_inverse=True, return_counts=True)
-    same = [shots[i].name for i in np.flatnonzero(count[back.reshape(-1)] > 1)]
+    same = [shots[i].name for i in np.flatnonzero(count[back.reshape(-1)] > 1).tolist()]
     if same:
         text = f"{len(same)} photographs have exactly the pose of another, {few(same)}: filled in, or copies"
         found.append(Finding("warning", "equal-poses", f"{text}; delete them from the model", tuple(same)))

@@ -114,8 +114,9 @@ def _gpu(number: int) -> Gpu:
 
 
 def _native() -> Native:
-    if (module := native.module()) is None:
+    if native.module() is None:
         return Native(lacking=native.lacking())
+    module = native.kernels()
     return Native(Path(module.__file__).name, module.compiler, tuple(module.kernels()), module.kernels_in_use())
 
 
@@ -125,7 +126,7 @@ def _packages() -> dict[str, str]:
     except importlib.metadata.PackageNotFoundError:  # a bare source tree
         asked = []
     found = {}
-    for name in sorted({re.match(r"[\w.-]+", line)[0] for line in asked}, key=str.lower):
+    for name in sorted({start[0] for line in asked if (start := re.match(r"[\w.-]+", line))}, key=str.lower):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -10,6 +10,7 @@ from surfkit.apps.doctor.gather import Gathered, depth_maps, heard
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import reading_again
 from surfkit.core.registry import name_of
+from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare_depth_maps import REMEDY, others_warning
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import SWITCHED_OFF, alignment, normals_warning, prepare_command
@@ -37,11 +38,11 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
     if not tracks and recipe.depth is not None:
         text = "there are no depth priors, and none can be made, as no photograph observes any sparse point"
         text = f"the run begins at depth maps: {text}" if stereo else f"{text}, so {SWITCHED_OFF}"
-        found = Finding("error" if stereo else "warning", "depth-priors", f"{text}; {make}")
-        return [found, *(_normals_to_come(recipe) if normals else [])]
+        lacking = Finding("error" if stereo else "warning", "depth-priors", f"{text}; {make}")
+        return [lacking, *(_normals_to_come(recipe.depth) if normals else [])]
     if not maps and recipe.depth is not None:
         text = f"there are no depth priors, so the run makes them, {len(names)} maps with {name_of(recipe.depth)}"
-        return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
+        return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe.depth) if normals else [])]
     if not maps and stereo:
         begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
         return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
@@ -54,10 +55,10 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
         found.append(Finding("warning", "depth-priors", text, tuple(missing)))
     sizes = [view_sizes(data, shot, (shot.camera.width, shot.camera.height)) for shot in train]
     longest = max(side for views in sizes for size in views for side in size)
-    if recipe.depth is not None and (text := others_warning(data.path, maps.values(), recipe.depth, longest)):
-        found.append(Finding("warning", "depth-priors", f"{text}{REMEDY}"))
-    if normals and (text := normals_warning(data, list(maps.values()))):
-        found.append(Finding("warning", "prior-normals", text))
+    if recipe.depth is not None and (others := others_warning(data.path, maps.values(), recipe.depth, longest)):
+        found.append(Finding("warning", "depth-priors", f"{others}{REMEDY}"))
+    if normals and (bare := normals_warning(data, list(maps.values()))):
+        found.append(Finding("warning", "prior-normals", bare))
     return found if quick else [*found, *_numbers(data, gathered, maps)]
 
 
@@ -90,12 +91,12 @@ def _numbers(data: Data, gathered: Gathered, maps: Collection[str]) -> list[Find
     return [Finding("warning", "depth-maps", text) for text in said]
 
 
-def _normals_to_come(recipe: Recipe) -> list[Finding]:
+def _normals_to_come(estimator: DepthEstimator) -> list[Finding]:
     """Maps that the run makes have no normals if its estimator gives none."""
-    if recipe.depth is not None and recipe.depth.oriented:
+    if estimator.oriented:
         return []
     text = (
-        f"the loss normal-prior learns nothing from depth priors without normals, and {name_of(recipe.depth)} gives "
-        "none; depth:patch-match does"
+        f"the loss normal-prior learns nothing from depth priors without normals, and {name_of(estimator)} gives none; "
+        "depth:patch-match does"
     )
     return [Finding("warning", "prior-normals", text)]

@@ -281,7 +281,8 @@ def _taken(
     state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
     state.index = part.index
     wanted = max(WARM + 1, job.steps // len(job.parts))
-    times, begun = [], time.perf_counter()
+    times: list[tuple[bool, float]] = []
+    begun = time.perf_counter()
     while len(times) < wanted and state.index < trainer.stage.steps:
         times.append(_timed(trainer, state))
         if time.perf_counter() - begun > job.seconds / len(job.parts) and len(times) > WARM:

@@ -41,7 +41,7 @@ class Bins:
 
 def corners_of(surface: SurfaceFile, grid: MapGrid, numbers: np.ndarray | slice) -> np.ndarray:
     """(n, 3, 3) float64 column, row and height of the corners of some triangles."""
-    return grid.to_cells(surface.vertices(np.asarray(surface.faces[numbers]).ravel())).reshape(-1, 3, 3)
+    return grid.to_cells(surface.vertices(np.asarray(surface.triangles[numbers]).ravel())).reshape(-1, 3, 3)
 
 
 def sort_faces(surface: SurfaceFile, grid: MapGrid, side: int, file: Path) -> Bins:
@@ -54,7 +54,7 @@ def sort_faces(surface: SurfaceFile, grid: MapGrid, side: int, file: Path) -> Bi
         file: Where their numbers are kept while the map is drawn.
     """
     across, down = -(-grid.width // side), -(-grid.height // side)
-    counts, total = np.zeros(across * down, np.int64), len(surface.faces)
+    counts, total = np.zeros(across * down, np.int64), len(surface.triangles)
     for at in range(0, total, BATCH_TRIANGLES):
         tiles, _ = _pairs(surface, grid, side, slice(at, at + BATCH_TRIANGLES))
         counts += np.bincount(tiles, minlength=len(counts))

@@ -83,8 +83,9 @@ def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarra
     low-discrepancy sequence. So there are the same points however many are made at once.
     """
     colored, so_far, number = has_colors(surface), 0.0, 0
-    for start in range(0, len(surface.faces), BATCH_TRIANGLES):
-        faces = np.asarray(surface.faces[start : start + BATCH_TRIANGLES])
+    total = len(surface.triangles)
+    for start in range(0, total, BATCH_TRIANGLES):
+        faces = np.asarray(surface.triangles[start : start + BATCH_TRIANGLES])
         corners = surface.vertices(faces.ravel()).reshape(-1, 3, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         ends = so_far + np.cumsum(np.linalg.norm(normals, axis=1) / 2)
@@ -104,4 +105,4 @@ def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarra
                 values = np.stack([rows[name].reshape(-1, 3) for name in COLOR_CHANNELS], axis=2)
                 colors = np.rint((shares[:, :, None] * values).sum(1)).astype(np.uint8)
             yield places, colors
-        emit(Progress("sampling points", min(start + BATCH_TRIANGLES, len(surface.faces)), len(surface.faces)))
+        emit(Progress("sampling points", min(start + BATCH_TRIANGLES, total), total))

@@ -68,28 +68,28 @@ class MapsCommand:
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
-            other = None if self.against is None else self._other(frame)
+            other = None if self.against is None else self._other(self.against, frame)
             record = make_maps(MeshWithPhotos(surface, frame, scene.train), self.settings, out, other)
             note_held_out(run, scene)
         show(out, record)
 
-    def _other(self, frame: Frame) -> SurfaceFile:
+    def _other(self, against: Path, frame: Frame) -> SurfaceFile:
         """The mesh to subtract; BadInput if it is known to lie in other coordinates."""
-        if not self.against.is_dir():
-            theirs = system_of(self.against)
-            if theirs is not None and frame.crs is not None and not same_plan(theirs, frame.crs):
+        if not against.is_dir():
+            system = system_of(against)
+            if system is not None and frame.crs is not None and not same_plan(system, frame.crs):
                 raise BadInput(
-                    f"--against {self.against}: its coordinates are in {theirs}, and those of {self.run_folder} in "
+                    f"--against {against}: its coordinates are in {system}, and those of {self.run_folder} in "
                     f"{frame.crs}; heights can be subtracted in one system only"
                 )
-            return heights_of(self.against)
-        run = opened(self.against)
+            return heights_of(against)
+        run = opened(against)
         refuse_no_mesh(run)
         theirs = read_unchanged(run).frame
         if not same_crs(theirs.crs, frame.crs):
             raise BadInput(
-                f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "
-                f"of {self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
+                f"--against {against}: its coordinate reference system is {theirs.crs or 'not known'}, and that of "
+                f"{self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
             )
         if frame.crs is None:
             emit(Warned("neither run is georeferenced; their coordinates are taken to be the same"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -124,7 +125,7 @@ def contour_lines(
     found = []
     for level in range(first, last + 1):
         height = float(f"{level * interval:.12g}")  # 0.3 and not 0.30000000000000004, as labels show it
-        for line in tracer.lines(height):
+        for line in cast("list[np.ndarray]", tracer.lines(height)):  # an array a line, where nothing else is asked for
             if len(line) > 1:
                 place = np.stack([grid.west + line[:, 0], grid.north - line[:, 1]], axis=1) * grid.gsd
                 found.append((height, place))

@@ -147,7 +147,7 @@ def draw_difference(path: Path, raster: Path, found: Difference, unit: str) -> N
     reach = max(float(np.percentile(np.abs(shown.compressed()), COLOR_PERCENTILE)), 1e-9)
     rows, columns = (np.flatnonzero(~np.ma.getmaskarray(shown).all(axis)) for axis in (1, 0))
     wide, high = (east - west) / shape[1], (north - south) / shape[0]
-    style = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
+    style: dict[Any, Any] = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
     with matplotlib.rc_context(style):
         figure = Figure(PICTURE_INCHES, PICTURE_DPI, layout="constrained")
         axes = figure.add_subplot(xlabel=f"easting, {unit}", ylabel=f"northing, {unit}")

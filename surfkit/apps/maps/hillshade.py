@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.map_grid import Window
 from surfkit.apps.maps.rasters import NODATA, window_of
 from surfkit.core.events import Progress, emit
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
 
 LIGHT_AZIMUTH_DEGREES, LIGHT_ALTITUDE_DEGREES = 315.0, 45.0
 """Degrees: the light comes from the north-west, as maps have it."""
@@ -43,7 +47,7 @@ def hillshade(heights: np.ndarray, gsd: float) -> np.ndarray:
     return np.where(np.isfinite(share), np.rint(1 + 254 * share), 0).astype(np.uint8)
 
 
-def _with_margin(model: object, window: Window) -> np.ndarray:
+def _with_margin(model: DatasetReader, window: Window) -> np.ndarray:
     """(H + 2, W + 2) float64 heights of a window and the cells around it; NaN where there is no surface."""
     left, top = max(0, window.left - 1), max(0, window.top - 1)
     right = min(model.width, window.left + window.width + 1)
@@ -55,7 +59,7 @@ def _with_margin(model: object, window: Window) -> np.ndarray:
     return found
 
 
-def read_heights(model: object, window: Window) -> np.ndarray:
+def read_heights(model: DatasetReader, window: Window) -> np.ndarray:
     """(H, W) float64 heights of a window of an open surface model; NaN where there is no surface."""
     found = model.read(1, window=window_of(window)).astype(np.float64)
     found[found == NODATA] = np.nan

@@ -112,36 +112,34 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
     with needed("rasterio", "surfkit maps"):
         from rasterio.crs import CRS
         from rasterio.errors import CRSError
-    text = frame.crs
-    if text is None:
+    crs = frame.crs
+    if crs is None:
         unit = "metre" if frame.metres == 1 else "unit"
         told = f"{frame.metres:.15g} m" if frame.metres else "of unknown length"
         local = f'LOCAL_CS["local, not georeferenced",UNIT["{unit}",{frame.metres or 1:.15g}]]'
         return CRS.from_wkt(local), "local coordinates, not georeferenced; unit: " + (
             "1 m" if unit == "metre" else told
         )
-    if place := TOPOCENTRIC.fullmatch(text):
-        text = f"+proj=ortho +lat_0={place[1]} +lon_0={place[2]} +ellps=WGS84 +units=m"
+    place = TOPOCENTRIC.fullmatch(crs)
+    text = f"+proj=ortho +lat_0={place[1]} +lon_0={place[2]} +ellps=WGS84 +units=m" if place else crs
     try:
         found = CRS.from_user_input(text)
     except CRSError as error:
-        raise BadInput(f"coordinate reference system {frame.crs!r}: GDAL does not know it: {error}") from error
+        raise BadInput(f"coordinate reference system {crs!r}: GDAL does not know it: {error}") from error
     if not found.is_projected:
         raise BadInput(
-            f"coordinate reference system {frame.crs!r}: maps need easting and northing in units of length; convert "
+            f"coordinate reference system {crs!r}: maps need easting and northing in units of length; convert "
             "the cameras to a projected system such as UTM"
         )
-    refuse_other_unit(frame.crs, frame.metres, frame.origin)
-    refuse_stretched(frame)
+    refuse_other_unit(crs, frame.metres, frame.origin)
+    refuse_stretched(crs, frame.origin)
     return found, f"{text}, for coordinates about a place on Earth" if place else text
 
 
-def refuse_stretched(frame: Frame) -> None:
+def refuse_stretched(crs: str, place: np.ndarray) -> None:
     """BadInput for a map on which areas and volumes would be far from those on the ground; a line if they are off."""
-    longer = 1 / scale_at(frame.crs, frame.origin)
-    told = (
-        f"{frame.crs}: lengths on the map are {longer:.4g} times those on the ground here, areas {longer**2:.4g} times"
-    )
+    longer = 1 / scale_at(crs, place)
+    told = f"{crs}: lengths on the map are {longer:.4g} times those on the ground here, areas {longer**2:.4g} times"
     if abs(longer - 1) > MAX_SCALE_ERROR:
         raise BadInput(f"{told}; convert the cameras to a system that keeps lengths, such as UTM")
     if abs(longer - 1) > QUIET_SCALE_ERROR:
@@ -150,7 +148,7 @@ def refuse_stretched(frame: Frame) -> None:
 
 def same_crs(one: str | None, other: str | None) -> bool:
     """Whether two coordinate reference systems are the same one, however they are spelt."""
-    if one == other or None in (one, other) or TOPOCENTRIC.fullmatch(one) or TOPOCENTRIC.fullmatch(other):
+    if one == other or one is None or other is None or TOPOCENTRIC.fullmatch(one) or TOPOCENTRIC.fullmatch(other):
         return one == other
     with needed("rasterio", "surfkit maps"):
         from rasterio.crs import CRS

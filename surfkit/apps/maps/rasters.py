@@ -114,9 +114,9 @@ class Raster:
                 size = {"xSize": str(width), "ySize": str(height)}
                 facts = {"RasterXSize": str(width), "RasterYSize": str(height), "DataType": kind}
                 block = {"BlockXSize": str(TILE_SIDE_CELLS), "BlockYSize": str(TILE_SIDE_CELLS)}
-                ElementTree.SubElement(source, "SourceProperties", **facts, **block)
-                ElementTree.SubElement(source, "SrcRect", xOff="0", yOff="0", **size)
-                ElementTree.SubElement(source, "DstRect", xOff=str(left), yOff=str(top), **size)
+                ElementTree.SubElement(source, "SourceProperties", facts | block)
+                ElementTree.SubElement(source, "SrcRect", {"xOff": "0", "yOff": "0"} | size)
+                ElementTree.SubElement(source, "DstRect", {"xOff": str(left), "yOff": str(top)} | size)
         path = self.folder / "whole.vrt"
         ElementTree.ElementTree(root).write(path)
         return path

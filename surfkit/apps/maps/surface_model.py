@@ -124,7 +124,7 @@ def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
         row, column = np.divmod(cells, window.width)
         places = column + window.left + 0.5, row + window.top + 0.5
         inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
-        rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
+        rows = bins.surface.rows[np.asarray(bins.surface.triangles[used]).ravel()]
         for channel, name in enumerate(COLOR_CHANNELS):
             values = rows[name] if colored else np.full(len(rows), UNSEEN_GREY)
             a, b, c = values.reshape(-1, 3).T.astype(np.float64)

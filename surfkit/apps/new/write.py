@@ -140,7 +140,7 @@ def _dependencies(template: Template) -> list[str]:
     for path, text in template.python.items():
         for node in ast.walk(ast.parse(text)) if path.startswith("new_plugin") else ():
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
             found |= {name.partition(".")[0] for name in names}
     return ["surfkit", *sorted(found - {"surfkit"} - set(sys.stdlib_module_names))]
 

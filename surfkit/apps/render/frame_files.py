@@ -140,7 +140,7 @@ def spread(maps: Maps) -> tuple[float, float] | None:
 def shown(maps: Maps, show: Show, bounds: tuple[float, float] | None) -> Tensor:
     """(3, H, W) in [0, 1]."""
     if show == "color":
-        return maps.color.detach().cpu()
+        return maps.need("color").detach().cpu()
     if show == "depth":
         return colour_depth(depth_of(maps), bounds)
     if maps.normal is None:

@@ -126,9 +126,9 @@ def from_file(path: Path, frame: Frame, lens: Camera, count: int) -> CameraPath:
         if len(frames) > MAX_FRAMES:
             raise BadInput(f"{path}: it has {len(frames)} cameras; at most {MAX_FRAMES} frames are rendered")
         rate = data.get("fps")
-        known = isinstance(rate, (int, float)) and 0 < rate <= 1000
+        fps = float(rate) if isinstance(rate, (int, float)) and 0 < rate <= 1000 else None
         found = [_of_nerfstudio(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(frames)]
-        return CameraPath(found, float(rate) if known else None)
+        return CameraPath(found, fps)
     if isinstance(data, list) and data:
         keys = [_of_viewer(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(data)]
         return through(keys, lens, count)

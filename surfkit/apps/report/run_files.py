@@ -145,8 +145,9 @@ def read_sources(outs: Sequence[Path]) -> tuple[RunFiles, ...]:
 def total_loss(line: dict[str, Any]) -> float | None:
     """The sum of the weighted losses of a step."""
     losses = line.get("losses")
-    values = [number(losses, name) for name in losses] if isinstance(losses, dict) and losses else [None]
-    return None if None in values else sum(values)
+    values = [number(losses, name) for name in losses] if isinstance(losses, dict) else []
+    known = [value for value in values if value is not None]
+    return sum(known) if known and len(known) == len(values) else None
 
 
 def heading(run: RunFiles, runs: Sequence[RunFiles]) -> str:

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -77,7 +78,7 @@ def _drawing(lines: Sequence[ChartSeries], right: float, top: float | None, x_la
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
-    style = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
+    style: dict[Any, Any] = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
     colors = dict.fromkeys(
         ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK_PLACEHOLDER
     )

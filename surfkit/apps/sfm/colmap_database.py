@@ -5,7 +5,7 @@ A pair is compared once. When photographs or features change, a new database tak
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -221,7 +221,7 @@ def _write_photos(
     cameras: Mapping[str, Any] | None,
 ) -> dict[str, int]:
     """The number of each photograph in the database, by its name."""
-    lenses: dict[int | str, tuple[int, int]] = {}
+    lenses: dict[Hashable, tuple[int, int]] = {}
     numbers = {}
     camera_type = engine.SensorType.CAMERA
     groups = lens_groups(photos) if cameras is None else [str(cameras[photo.name]) for photo in photos]

@@ -192,7 +192,7 @@ def _degrees(value: Any, letter: Any, positive: str, negative: str, most: float)
 
 def _reference(tags: Mapping[int, Any]) -> int | None:
     """What the altitude is counted from; None where that is not said."""
-    value = tags.get(ALTITUDE_REF_TAG)
+    value: Any = tags.get(ALTITUDE_REF_TAG)
     try:
         found = value[0] if isinstance(value, bytes) else int(value)
     except (TypeError, ValueError, IndexError):

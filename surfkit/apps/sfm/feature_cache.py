@@ -89,8 +89,8 @@ def _keep(find: Find, photo: Photo, path: Path, sources: Sources, settings: Sett
         seen = sources.read_mask(photo.name, size)[row, column]
         keypoints, descriptors = keypoints[seen], descriptors[seen]
     keypoints = scaled(keypoints, size, photo.size)
-    with replacing(path) as file:
-        np.savez(file, keypoints=keypoints, descriptors=descriptors)
+    with replacing(path) as kept:
+        np.savez(kept, keypoints=keypoints, descriptors=descriptors)
     return len(keypoints)
 
 

@@ -73,7 +73,7 @@ class Focal:
 
 def exif_focals(model: Any, photos: Mapping[str, Photo]) -> dict[int, float]:
     """The focal length in EXIF of each placed camera of a pycolmap.Reconstruction, pixels, by its number."""
-    found = {}
+    found: dict[int, float] = {}
     for number in model.reg_image_ids():
         image = model.image(number)
         if (focal := photos[image.name].exif.focal_px) is not None:
@@ -181,7 +181,7 @@ class Weighed:
                     f"{self.heights:.2f} times: write the focal length into EXIF, add oblique photographs, or check "
                     "heights with --gcp"
                 )
-            if focal.contradicts:
+            if focal.exif is not None and focal.contradicts:
                 found.append(
                     f"the focal length in EXIF of {focal.photographs} photographs is {focal.exif:.0f} px, that by the "
                     f"photographs alone {focal.alone:.0f} px ({focal.alone / focal.exif - 1:+.0%}; EXIF is taken to be "
@@ -228,9 +228,10 @@ def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[
     """
     counts = Counter(final.image(number).camera_id for number in final.reg_image_ids())
     known = exif_focals(final, photos)
+    before, after = alone.cameras, final.cameras
     focals = [
-        Focal(known.get(number), *(model.cameras[number].mean_focal_length() for model in (alone, final)), count)
-        for number, count in counts.most_common()
+        Focal(known.get(at), before[at].mean_focal_length(), after[at].mean_focal_length(), count)
+        for at, count in counts.most_common()
     ]
     heights = _relative_height(final) / max(_relative_height(alone), 1e-9)
     axes = np.stack([final.image(number).cam_from_world().matrix()[2, :3] for number in final.reg_image_ids()])

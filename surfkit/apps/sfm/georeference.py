@@ -138,7 +138,8 @@ def to_chart(chart: MapProjection, positions: np.ndarray) -> np.ndarray:
         away = np.abs((positions[:, 1] - (6 * zone[0] - 183) + 180) % 360 - 180)
         reached = (np.abs(positions[:, 0]) <= MAX_UTM_LATITUDE) & (away < MAX_UTM_OFFSET_DEGREES)
         flat = np.full((len(positions), 2), np.nan)
-        flat[reached] = np.array([utm(*row, *zone) for row in positions[reached, :2].tolist()]).reshape(-1, 2)
+        degrees = positions[reached, :2].tolist()
+        flat[reached] = np.array([utm(latitude, longitude, *zone) for latitude, longitude in degrees]).reshape(-1, 2)
     else:
         flat = _by_pyproj(chart.crs, positions)
     return np.column_stack([flat, positions[:, 2] / chart.metres]) - chart.offset

@@ -244,10 +244,11 @@ def place_by_points(model: Any, ground: GroundControl, held_back: int) -> Contro
     """
     points, chart, onto = ground.points, ground.chart, ground.onto
     images = {model.image(number).name: model.image(number) for number in model.reg_image_ids()}
-    placed = [triangulate(images, point.marks) for point in points]
-    seen = [at for at, xyz in enumerate(placed) if xyz is not None]
+    found = [triangulate(images, point.marks) for point in points]
+    placed = {at: xyz for at, xyz in enumerate(found) if xyz is not None}
+    seen = list(placed)
     unseen = tuple(point.name for at, point in enumerate(points) if at not in set(seen))
-    spread = np.linspace(0, len(seen) - 1, held_back + 2).round().astype(int)[1:-1] if held_back else []
+    spread = np.linspace(0, len(seen) - 1, held_back + 2).round().astype(int)[1:-1].tolist() if held_back else []
     back = {seen[at] for at in spread} if len(seen) >= MIN_CONTROL_POINTS + held_back else None
     if back is None:
         also = f" besides {held_back} checkpoints" if held_back else ""
@@ -316,8 +317,8 @@ def doubts(control: ControlResiduals, centres: Mapping[str, np.ndarray], photos:
         return found
     ours = control.similarity.points(np.stack([centres[name] for name in known]))
     away = (ours - to_chart(control.chart, np.array([exif[name].position for name in known], np.float64))) * metres
-    across = np.linalg.norm(away[:, :2], axis=1)
-    across = float(np.median(np.where(np.isfinite(across), across, np.inf)))
+    apart = np.linalg.norm(away[:, :2], axis=1)
+    across = float(np.median(np.where(np.isfinite(apart), apart, np.inf)))
     rise = float(np.median(away[np.isfinite(away[:, 2]), 2])) if np.isfinite(away[:, 2]).any() else 0.0
     if across > MAX_POSITION_ERROR_M:
         far = f"{across / 1000:.0f} km" if np.isfinite(across) else "out of reach"
@@ -357,6 +358,6 @@ def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, floa
         if np.linalg.cond(total) > 1e8:
             return None  # all rays are one
         point = np.linalg.solve(total, np.sum([m @ c for m, (c, _) in zip(across, rays, strict=True)], axis=0))
-        weights = np.array([1 / max(np.linalg.norm(point - c), 1e-9) ** 2 for c, _ in rays])
+        weights = np.array([1 / max(float(np.linalg.norm(point - c)), 1e-9) ** 2 for c, _ in rays])
         weights /= weights.max()
     return point

@@ -138,7 +138,8 @@ def _system(text: str, where: str) -> System:
 
 def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[PositionRow], bool]:
     """The system that a line before the positions names, the rows, and whether names of columns say degrees."""
-    system, header, rows, degrees = None, None, [], False
+    system, header, degrees = None, None, False
+    rows: list[PositionRow] = []
     for at, line in enumerate(lines, 1):
         text = line.strip()
         comment = COMMENT.fullmatch(text)

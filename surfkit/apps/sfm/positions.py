@@ -8,7 +8,8 @@ by that have letters; what is still open has several readings, among which the c
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -87,12 +88,12 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
         if not found.positions:
             raise BadInput(f"{said}: it names none of the {len(photos)} photographs, such as {photos[0].name!r}")
     else:
-        path = next((path for path in (root / GEO_FILE, root.absolute().parent / GEO_FILE) if path.is_file()), None)
-        if path is None:
+        near = next((path for path in (root / GEO_FILE, root.absolute().parent / GEO_FILE) if path.is_file()), None)
+        if near is None:
             return list(photos), None
-        said = str(path)
+        said = str(near)
         try:
-            found = _named(read_list(path, said), photos, said)
+            found = _named(read_list(near, said), photos, said)
         except BadInput as error:
             raise BadInput(
                 f"{error}; {GEO_FILE} is read as OpenDroneMap's list of positions: mend it, or rename it"
@@ -110,7 +111,8 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
     away = [
         _distance(before.exif.position, after.exif.position)
         for before, after in zip(photos, listed, strict=True)
-        if before.exif.position is not None and not before.exif.unsigned and after is not before
+        if after is not before and not before.exif.unsigned
+        if before.exif.position is not None and after.exif.position is not None
     ]
     if away and np.median(away) > MAX_POSITION_ERROR_M:
         emit(
@@ -134,7 +136,12 @@ def _listed(photo: Photo, found: Listed) -> Photo:
 
 def _named(listed: Listed, photos: Sequence[Photo], said: str) -> Listed:
     """The list by the full names of photographs; it may leave out folders and endings, and write capitals otherwise."""
-    forms = (str, _without_folder, lambda name: _without_folder(name).lower(), _bare)
+    forms: tuple[Callable[[str], str], ...] = (
+        str,
+        _without_folder,
+        lambda name: _without_folder(name).lower(),
+        _bare,
+    )
     tables: list[dict[str, list[str]]] = []
     for form in forms:
         table: dict[str, list[str]] = {}
@@ -180,12 +187,14 @@ def _by_xmp(photos: Sequence[Photo]) -> list[Photo]:
             only.append(photo.name)
             exif = replace(exif, position=xmp, unsigned=(), no_reference=False)
         elif exif.position is not None:
+            position = exif.position
             if exif.unsigned and xmp is not None:
-                signed = _like(exif.position, xmp, exif.unsigned)
+                signed = _like(position, xmp, exif.unsigned)
                 if _distance(signed, xmp) < APART_M:
                     signs.append(photo.name)
+                    position = signed
                     exif = replace(exif, position=signed, unsigned=())
-            if xmp is not None and _distance(exif.position, xmp) > APART_M:
+            if xmp is not None and _distance(position, xmp) > APART_M:
                 apart.append(photo.name)
             exif = _altitude_by_xmp(exif)
         found.append(replace(photo, exif=exif))
@@ -205,10 +214,11 @@ def _by_xmp(photos: Sequence[Photo]) -> list[Photo]:
 
 def _altitude_by_xmp(exif: Exif) -> Exif:
     """The altitude of XMP where EXIF has none, or says not which side of its zero it is on."""
-    (latitude, longitude, altitude), other = exif.position, exif.xmp_altitude
-    if other is None or (altitude is not None and not exif.no_reference):
+    other = exif.xmp_altitude
+    if exif.position is None or other is None:
         return exif
-    if altitude is not None and abs(abs(altitude) - abs(other)) > 1:
+    latitude, longitude, altitude = exif.position
+    if altitude is not None and (not exif.no_reference or abs(abs(altitude) - abs(other)) > 1):
         return exif
     return replace(exif, position=(latitude, longitude, other), no_reference=False)
 
@@ -237,7 +247,8 @@ def _by_neighbours(photos: Sequence[Photo]) -> list[Photo]:
 def _heights(photos: Sequence[Photo]) -> list[Photo]:
     """The photographs with altitudes that may be believed; says what was done to them, and how many have none."""
     given = [photo for photo in photos if photo.exif.position is not None]
-    heights = {photo.name: photo.exif.position[2] for photo in given if photo.exif.position[2] is not None}
+    places = {photo.name: photo.exif.position for photo in photos if photo.exif.position is not None}
+    heights = {name: place[2] for name, place in places.items() if place[2] is not None}
     if len(heights) > 1 and not any(heights.values()):
         emit(Warned(f"the altitudes of all {len(heights)} positions are 0, and count as missing"))
         heights = {}
@@ -253,9 +264,10 @@ def _heights(photos: Sequence[Photo]) -> list[Photo]:
                 f"(GPSAltitudeRef); it is taken as above: {few(unsure)}"
             )
         )
-    if given and not heights and all(photo.exif.above_start is not None for photo in given):
+    above = {photo.name: photo.exif.above_start for photo in given if photo.exif.above_start is not None}
+    if given and not heights and len(above) == len(given):
         emit(Warned("no position has an altitude: heights are those above the place of the start, by XMP"))
-        heights = {photo.name: photo.exif.above_start for photo in given}
+        heights = above
         photos = [replace(photo, exif=replace(photo.exif, zero=None)) for photo in photos]
     elif len(heights) < len(given):
         rest = "; the others place the scene, if they are enough" if heights else ""
@@ -278,20 +290,21 @@ def no_letters(photos: Sequence[Photo]) -> str:
 def _signed(photo: Photo, signs: Mapping[str, int]) -> Photo:
     if photo.exif.position is None or not photo.exif.unsigned:
         return photo
-    at = list(photo.exif.position)
-    for axis in photo.exif.unsigned:
-        at[GEODETIC_AXES.index(axis)] *= signs[axis]
-    return replace(photo, exif=replace(photo.exif, position=tuple(at), unsigned=()))
+    latitude, longitude = (
+        own * signs[axis] if axis in photo.exif.unsigned else own
+        for axis, own in zip(GEODETIC_AXES, photo.exif.position[:2], strict=True)
+    )
+    position = latitude, longitude, photo.exif.position[2]
+    return replace(photo, exif=replace(photo.exif, position=position, unsigned=()))
 
 
 def _like(position: Position, other: Position, axes: Sequence[str]) -> Position:
     """A position with the signs of another, along some axes."""
-    at = list(position)
-    for axis in axes:
-        at[GEODETIC_AXES.index(axis)] = float(
-            np.copysign(position[GEODETIC_AXES.index(axis)], other[GEODETIC_AXES.index(axis)])
-        )
-    return at[0], at[1], at[2]
+    latitude, longitude = (
+        math.copysign(own, theirs) if axis in axes else own
+        for axis, own, theirs in zip(GEODETIC_AXES, position[:2], other[:2], strict=True)
+    )
+    return latitude, longitude, position[2]
 
 
 def _distance(one: Position, other: Position) -> float:

@@ -112,7 +112,7 @@ def draw(path: Path, model: Any, placement: Placement | ControlResiduals | None)
     near = _box(xyz, cameras)
     figure = Figure(figsize=(9, 9.5))
     axes = figure.add_subplot()
-    axes.scatter(*xyz[:, :2].T, c=rgb, s=1.5, linewidths=0, rasterized=True)
+    axes.scatter(xyz[:, 0], xyz[:, 1], c=rgb, s=1.5, linewidths=0, rasterized=True)
     if isinstance(placement, Placement):
         onto = placement.onto
         lines = [(centres[name][:2], to[:2]) for name, to in zip(placement.names, onto, strict=True)]
@@ -121,7 +121,7 @@ def draw(path: Path, model: Any, placement: Placement | ControlResiduals | None)
         axes.plot([], [], color="tab:orange", linewidth=0.8, label="to its position")
         if not placement.fit.inside.all():
             axes.plot([], [], color="red", linewidth=0.8, label="position left out")
-    axes.scatter(*cameras[:, :2].T, marker="^", c="tab:blue", s=24, label=f"{len(cameras)} cameras")
+    axes.scatter(cameras[:, 0], cameras[:, 1], marker="^", c="tab:blue", s=24, label=f"{len(cameras)} cameras")
     axes.set(xlim=near[:, 0], ylim=near[:, 1], aspect="equal", xlabel="x", ylabel="y", title="from above")
     if placement is not None:
         east, north, _ = placement.chart.offset

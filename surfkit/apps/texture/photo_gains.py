@@ -60,7 +60,8 @@ def exposure_gains(shown: np.ndarray, color: np.ndarray, views: int) -> np.ndarr
                 one.append(np.where(swapped, second, first))
                 other.append(np.where(swapped, first, second))
                 ratio.append(np.where(swapped, -value, value))
-        logs[:, channel], compared = _fitted(*map(np.concatenate, (one, other, ratio)), views)
+        fitted = _fitted(np.concatenate(one), np.concatenate(other), np.concatenate(ratio), views)
+        logs[:, channel], compared = fitted
         known |= compared
     if known.any():
         logs[known] -= np.median(logs[known], axis=0)

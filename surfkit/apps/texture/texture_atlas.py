@@ -89,7 +89,8 @@ def make_atlas(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: n
     alone = view[order[first]] == NO_PHOTO
     low[alone], high[alone] = 0, high[alone] - PAD + 1  # patches have their rims: up to their fourth texel
     size, owner = high - low, tile[order[first]]
-    page, corner, pages = np.zeros(len(first), np.int32), np.zeros((len(first), 2), np.int64), []
+    page, corner = np.zeros(len(first), np.int32), np.zeros((len(first), 2), np.int64)
+    pages: list[AtlasPage] = []
     for number in range(int(tile.max()) + 1):
         rows = np.flatnonzero(owner == number)
         if not len(rows):

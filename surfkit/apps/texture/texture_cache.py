@@ -45,15 +45,15 @@ class TextureCache:
     def write(self, name: str, arrays: Arrays) -> None:
         """Keep arrays, instead of those of the same name."""
         if self.folder is not None:
-            with replacing(self._file(name)) as file:
-                np.savez(file, **arrays)
+            with replacing(self._file(self.folder, name)) as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
 
     def read(self, name: str) -> Arrays | None:
         """What was kept under a name; None if there is nothing, or it is damaged."""
-        if self.folder is None or not self._file(name).exists():
+        if self.folder is None or not self._file(self.folder, name).exists():
             return None
         try:
-            with np.load(self._file(name), allow_pickle=False) as found:
+            with np.load(self._file(self.folder, name), allow_pickle=False) as found:
                 return dict(found)
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
@@ -61,19 +61,20 @@ class TextureCache:
     def forget(self, name: str) -> None:
         """Delete what was kept under a name."""
         if self.folder is not None:
-            self._file(name).unlink(missing_ok=True)
+            self._file(self.folder, name).unlink(missing_ok=True)
 
-    def _file(self, name: str) -> Path:
-        return self.folder / f"{name}-{self.level}.npz"
+    def _file(self, folder: Path, name: str) -> Path:
+        return folder / f"{name}-{self.level}.npz"
 
 
 def identity(surface: SurfaceFile) -> str:
     """A digest of a mesh: of its vertices with all that they have, and its triangles."""
-    kinds = surface.rows.dtype, len(surface), surface.faces.dtype, len(surface.faces), surface.offset
+    faces = surface.triangles
+    kinds = surface.rows.dtype, len(surface), faces.dtype, len(faces), surface.offset
     found = hashlib.sha256(" ".join(map(str, kinds)).encode())
-    for rows in (surface.rows, surface.faces):
+    for rows in (surface.rows, faces):
         for at in range(0, len(rows), BATCH_ROWS):
-            found.update(np.ascontiguousarray(rows[at : at + BATCH_ROWS]))
+            found.update(np.ascontiguousarray(rows[at : at + BATCH_ROWS]).data)
     return found.hexdigest()
 
 
@@ -84,7 +85,7 @@ def seen(views: Sequence[View]) -> str:
         camera = view.camera
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         found.update(f"{view.name} {lens}".encode() + camera.world_to_camera.contiguous().numpy().tobytes())
-        mask = view.mask and view.mask.path
+        mask = None if view.mask is None else view.mask.path
         found.update(b"alpha" if view.mask is not None and view.mask.alpha else b"")
         for path in (view.path, mask):
             facts = path.stat() if path is not None and path.exists() else None

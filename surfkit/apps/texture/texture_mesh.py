@@ -247,7 +247,8 @@ def kept_mesh(kept: TextureCache, make: Callable[[], Mesh]) -> Mesh:
         mesh = make()
         return {name: value for name, value in vars(mesh).items() if isinstance(value, np.ndarray)}
 
-    return Mesh(**kept.once("mesh", arrays))
+    found = kept.once("mesh", arrays)
+    return Mesh(found["vertices"], found["faces"], found.get("colors"))
 
 
 def coarser(

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.depths import nearest
-from surfkit.raster.native import module
+from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
 
 HIDDEN_SLACK_PX = 2.0
@@ -110,7 +110,7 @@ def look(
     if module() is None:
         look_in_numpy(places, faces, photo, depth, slack, (covered, hidden, sums))
     else:
-        module().look(places, faces, depth, photo, slack, covered, hidden, sums, torch.get_num_threads())
+        kernels().look(places, faces, depth, photo, slack, covered, hidden, sums, torch.get_num_threads())
     return covered, hidden, sums
 
 

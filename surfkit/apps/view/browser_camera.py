@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from surfkit.scene.rotations import numpy_quaternions, numpy_rotations
 if TYPE_CHECKING:
     import viser
 
+T = TypeVar("T")
 WORLD = 10.0
 """Units of the page per local unit: keys move the camera by two units of the page a second."""
 REST_S = 0.3
@@ -161,6 +162,11 @@ def telling(client: viser.ClientHandle, action: Callable[..., None]) -> Callable
             client.add_notification("That did not work", " ".join(str(error).split()), color="red")
 
     return guarded
+
+
+def set_value(part: viser.GuiInputHandle[T], value: T) -> None:
+    """Set what an input shows."""
+    part.value = value  # type: ignore[misc]  # read-only for mypy, as viser declares the setter apart from the getter
 
 
 def ray_of(event: viser.SceneClickEvent) -> tuple[np.ndarray, np.ndarray]:

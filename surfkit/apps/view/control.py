@@ -71,12 +71,14 @@ class TrainingControl:
     def look(self, index: int, psnr: float | None) -> None:
         """See `Watcher.look`."""
         self.index = index
+        stage = self.stage
+        assert stage is not None, "a stage begins before its steps"
         if psnr is not None and index % PSNR_EVERY == 0:
-            self._note(index, psnr)
+            self._note(stage, index, psnr)
         if self.order is not None:
-            self._draw()
+            self._draw(stage)
         if self.paused:
-            self._wait()
+            self._wait(stage)
 
     def end(self) -> None:
         """See `Watcher.end`."""
@@ -106,18 +108,19 @@ class TrainingControl:
             self.changed.notify_all()
         return order.made.result()
 
-    def _note(self, index: int, psnr: float) -> None:
-        rows = self.psnrs[self.stage.folder]
+    def _note(self, stage: Watched, index: int, psnr: float) -> None:
+        rows = self.psnrs[stage.folder]
         while rows and rows[-1][0] >= index:  # steps that are made again
             rows.pop()
         rows.append((index, psnr))
 
-    def _draw(self) -> None:
+    def _draw(self, stage: Watched) -> None:
         with self.changed:
             order, self.order = self.order, None
+        assert order is not None, "orders are taken by the thread of the training alone"
         began = time.perf_counter()
         try:
-            drawn = self.stage.draw(order.view, order.geometry)
+            drawn = stage.draw(order.view, order.geometry)
             maps = Maps(**{name: value.detach().cpu() for name, value in drawn.present().items()})
         except Exception as error:  # also that memory ran out: a picture less, and the training goes on
             failed = error.with_traceback(None)  # whose frames hold memory
@@ -130,14 +133,14 @@ class TrainingControl:
         self.spent += time.perf_counter() - began
         order.made.set_result(RenderedStep(maps, self.index))
 
-    def _wait(self) -> None:
-        title = self.stage.title
+    def _wait(self, stage: Watched) -> None:
+        title = stage.title
         say(f"{title}: paused on the page after step {self.index}; it goes on from there, and Ctrl-C saves and stops")
-        while self.paused and not self.stage.stopping():
+        while self.paused and not stage.stopping():
             with self.changed:
                 if self.order is None and self.paused:
                     self.changed.wait(LOOK_S)
             if self.order is not None:
-                self._draw()
+                self._draw(stage)
         if not self.paused:
             say(f"{title}: goes on after step {self.index}")

@@ -56,7 +56,8 @@ class DrawLimit:
 
     def __init__(self, most: int | None = None, least: int = 0) -> None:
         """No pictures are known yet; the limit never becomes less than `least`."""
-        self.least, self.most, self.times, self.drawn, self.lowered = least, most, [], 0, -math.inf
+        self.least, self.most, self.drawn, self.lowered = least, most, 0, -math.inf
+        self.times: list[float] = []
 
     def allowed(self, wanted: int, moves: bool) -> int:
         """How many of those that a user wants are drawn."""

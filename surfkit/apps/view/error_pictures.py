@@ -46,8 +46,10 @@ def picture(view: View, kind: Kind, draw: Callable[[View], Maps] | None, frame: 
     maps = draw(view)
     if kind == "error":
         return error_picture(maps, view_photo(view).float() / 255)
-    if kind == "normal" and maps.normal is None:
-        raise BadInput("what this run has made draws no normals")
+    if kind == "normal":
+        if maps.normal is None:
+            raise BadInput("what this run has made draws no normals")
+        return _bytes(colour_normal(maps.normal)), "red to the right, green up, blue towards the camera"
     if kind == "depth":
         bounds = spread(maps)
         if bounds is None:
@@ -56,8 +58,6 @@ def picture(view: View, kind: Kind, draw: Callable[[View], Maps] | None, frame: 
         name = "m" if frame.metres else "units"
         told = f"near is pale: {bounds[0] * unit:.4g} {name}; far is dark: {bounds[1] * unit:.4g} {name}"
         return _bytes(shown(maps, "depth", bounds)), told
-    if kind == "normal":
-        return _bytes(colour_normal(maps.normal)), "red to the right, green up, blue towards the camera"
     return _bytes(shown(maps, "color", None)), "drawn by surfkit, as in training"
 
 
@@ -68,7 +68,7 @@ def error_picture(maps: Maps, photo: Tensor) -> tuple[np.ndarray, str]:
         maps: With colours.
         photo: (3, H, W) in [0, 1].
     """
-    color = maps.color.detach().cpu().float().clamp(0, 1)
+    color = maps.need("color").detach().cpu().float().clamp(0, 1)
     error = (color - photo).abs().mean(0)
     steps = np.linspace(0, WORST_ERROR, len(RAMP))
     colors = np.stack([np.interp(error.numpy(), steps, RAMP[:, i]) for i in range(3)], axis=2)

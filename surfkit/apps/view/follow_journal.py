@@ -83,7 +83,8 @@ class JournalFollower:
         """Nothing is read yet."""
         self.path = folder / journal.JOURNAL_FILE
         self.history = StageHistory()
-        self.file, self.at = None, 0
+        self.file: int | None = None
+        self.at = 0
 
     def read(self) -> bool:
         """Bring `history` up to date; whether there was anything new."""

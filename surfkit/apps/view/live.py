@@ -60,7 +60,7 @@ class Live:
         self.panel = LivePanel(page.viser.gui, self.control)
         serve_cursors(page.script, self._cursor_of, NO_COORDINATES_NOTE)
         page.viser.on_client_connect(self._connected)
-        page.viser.on_client_disconnect(lambda client: self.pages.pop(client.client_id, None))
+        page.viser.on_client_disconnect(self._disconnected)
         actions = {"pictures": self._draw_pictures, "panel": self._tell}
         self.threads = [threading.Thread(target=action, name=f"live {n}", daemon=True) for n, action in actions.items()]
         for thread in self.threads:
@@ -88,6 +88,9 @@ class Live:
         if self.around is not None:
             page.enter(self.around)
         self.pages[client.client_id] = page
+
+    def _disconnected(self, client: viser.ClientHandle) -> None:
+        self.pages.pop(client.client_id, None)
         self.wake.set()
 
     def _draw_pictures(self) -> None:

@@ -14,7 +14,7 @@ import torch
 
 from surfkit.apps.render.frame_files import view_of
 from surfkit.apps.render.path import beside, middle_of, up_of
-from surfkit.apps.view.browser_camera import WORLD, pose_of, ray_of, stand_at, telling, whole_view
+from surfkit.apps.view.browser_camera import WORLD, pose_of, ray_of, set_value, stand_at, telling, whole_view
 from surfkit.apps.view.control import TrainingControl
 from surfkit.apps.view.cursor import Cursor
 from surfkit.apps.view.error_pictures import picture
@@ -128,7 +128,7 @@ class LivePage:
         """Show another scene; the first one is looked at from where all of it is seen."""
         first, self.around, self.photo, self.shown = self.around is None, around, None, None
         self.number.max = len(around.views)
-        self.number.value = min(int(self.number.value), len(around.views))
+        set_value(self.number, min(int(self.number.value), len(around.views)))
         if first:
             up, at, middle = around.first
             with self.client.atomic():
@@ -161,7 +161,8 @@ class LivePage:
 
     def _draw(self) -> None:
         around, kind = self.around, self.kind.value
-        chosen = self._chosen if self.place.value == CAMERA_PLACE else None
+        assert around is not None, "no picture is wanted before there is a scene"
+        chosen = self._chosen(around) if self.place.value == CAMERA_PLACE else None
         camera = self._camera() if chosen is None else chosen.camera.fitted(int(self.longest.value))
         view = replace(chosen, camera=camera) if chosen is not None else view_of(camera)
         following = self.cursor is not None and self.cursor.on.value
@@ -172,7 +173,7 @@ class LivePage:
         image, told = picture(view, kind, lambda _: drawing.maps, around.scene.frame)
         images, window = [image], image.shape[:2]
         if chosen is not None:
-            images, told = self._beside_photograph(view, image, told)
+            images, told = self._beside_photograph(around, view, image, told)
             window = window_of((image.shape[0], len(images) * image.shape[1]), self.client.camera.aspect)
         depth = surface_depth(drawing.maps) if following else None
         self.client.scene.set_background_image(framed(images, window), format="jpeg", jpeg_quality=JPEG_QUALITY)
@@ -190,9 +191,8 @@ class LivePage:
         place = shown.place(0.5 + x / (2 * self.client.camera.aspect), 0.5 + y / 2)
         return "" if place is None else coordinates(place, around.scene.frame, around.first[0])
 
-    @property
-    def _chosen(self) -> View:
-        return self.around.views[int(self.number.value) - 1]
+    def _chosen(self, around: SceneWithoutModel) -> View:
+        return around.views[int(self.number.value) - 1]
 
     def _camera(self) -> Camera:
         """That of the browser."""
@@ -202,15 +202,17 @@ class LivePage:
         focal = height / 2 / math.tan(at.fov / 2)
         return Camera(torch.from_numpy(pose_of(at)), focal, focal, width / 2, height / 2, width, height)
 
-    def _beside_photograph(self, view: View, image: np.ndarray, told: str) -> tuple[list[np.ndarray], str]:
+    def _beside_photograph(
+        self, around: SceneWithoutModel, view: View, image: np.ndarray, told: str
+    ) -> tuple[list[np.ndarray], str]:
         """The photograph, and a picture of its camera."""
         key = view.name, view.camera.width
         if self.photo is None or self.photo[0] != key:
             try:
-                self.photo = key, picture(view, "photograph", None, self.around.scene.frame)[0]
+                self.photo = key, picture(view, "photograph", None, around.scene.frame)[0]
             except BadInput as error:
                 return [image], f"{error}. {told}"
-        held = " (held out)" if view.name in self.around.held_out else ""
+        held = " (held out)" if view.name in around.held_out else ""
         return [self.photo[1], image], f"**{view.name}**{held} beside the picture; {told}"
 
     def _changed(self) -> None:
@@ -227,22 +229,21 @@ class LivePage:
 
     def _numbered(self, event: Any) -> None:
         if event.client is not None:
-            self.place.value = CAMERA_PLACE
+            set_value(self.place, CAMERA_PLACE)
             self._changed()
 
     def _step(self, word: str) -> None:
         if self.around is None:
             raise BadInput("there is no camera yet: the data set is not read")
         if word == "stand there":
-            camera = self._chosen.camera
+            camera = self._chosen(self.around).camera
             stand_at(self.client, camera.world_to_camera.numpy(), TURNING_DISTANCE)
             self.client.camera.fov = whole_view(camera, self.client.camera.aspect)
-            self.place.value = FREE_PLACE
+            set_value(self.place, FREE_PLACE)
         else:
-            self.number.value = (int(self.number.value) - 1 + (1 if word == "next" else -1)) % len(
-                self.around.views
-            ) + 1
-            self.place.value = CAMERA_PLACE
+            at = int(self.number.value) - 1 + (1 if word == "next" else -1)
+            set_value(self.number, at % len(self.around.views) + 1)
+            set_value(self.place, CAMERA_PLACE)
         self._changed()
 
     def _click(self, event: viser.SceneClickEvent) -> None:
@@ -251,7 +252,8 @@ class LivePage:
         _, corners = corners_of([view.camera for view in self.around.views], self.around.size)
         met = hit_camera(corners, *ray_of(event))
         if met is not None:
-            self.number.value, self.place.value = met + 1, CAMERA_PLACE
+            set_value(self.number, met + 1)
+            set_value(self.place, CAMERA_PLACE)
             self._changed()
 
     def _draw_cameras(self) -> None:

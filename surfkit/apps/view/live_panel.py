@@ -18,6 +18,7 @@ from surfkit.train.watch import Watched
 
 if TYPE_CHECKING:
     import viser
+    from viser import uplot
 
 NEWEST = "what runs now"
 STROKE_COLORS = (
@@ -118,11 +119,12 @@ class LivePanel:
         if chart is not None:
             chart.remove()
         strokes = itertools.cycle(STROKE_COLORS)
-        series = ({"label": "step"}, *({"label": name, "stroke": next(strokes), "width": 2} for name in names))
+        series: list[uplot.Series] = [{"label": "step"}]
+        series += [{"label": name, "stroke": next(strokes), "width": 2} for name in names]
         with self.curves:
             chart = self.gui.add_uplot(
                 data,
-                series,
+                tuple(series),
                 title=title,
                 scales={"x": {"time": False}},
                 legend={"show": len(names) > 1},

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.scene.earth import TOPOCENTRIC
+from surfkit.scene.crs import TOPOCENTRIC
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes
 

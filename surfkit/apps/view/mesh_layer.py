@@ -69,10 +69,12 @@ class MeshLayer:
     def draw(self) -> None:
         """Send what the switches say."""
         with self.drawing:
-            switches = ((self.budget, not self.whole), (self.pictures, self.textured is not None))
-            more = [(self.by, not self.plain.value)] if self.by is not None else []
-            for part, sensible in (*switches, (self.plain, True), (self.note, True), *more):
-                part.visible = self.shown.value and sensible
+            shown = self.shown.value
+            self.budget.visible = shown and not self.whole
+            self.pictures.visible = shown and self.textured is not None
+            self.plain.visible = self.note.visible = shown
+            if self.by is not None:
+                self.by.visible = shown and not self.plain.value
             self.asked = self.wanted()
             if not self.shown.value:
                 self.client.scene.remove_by_name("/mesh")

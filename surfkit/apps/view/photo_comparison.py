@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from surfkit.apps.view.browser_camera import REST_S, WORLD, quaternion_of, stand_at, telling, whole_view
+from surfkit.apps.view.browser_camera import REST_S, WORLD, quaternion_of, set_value, stand_at, telling, whole_view
 from surfkit.apps.view.error_pictures import PICTURE_KINDS, Kind, picture, thumbnail
 from surfkit.apps.view.escape_text import as_text
 from surfkit.apps.view.layers import Layers
@@ -74,7 +74,7 @@ class PhotoComparisonTool:
         """Show a camera, and stand there if that is wanted."""
         self.chosen = at
         if self.number.value != at + 1:
-            self.number.value = at + 1
+            set_value(self.number, at + 1)
         if stand:
             self.stand()
         self.show()

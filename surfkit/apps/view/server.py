@@ -19,7 +19,7 @@ import sys
 import threading
 import warnings
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
@@ -147,7 +147,8 @@ def listen(address: Address) -> socket.socket:
         except OSError as error:
             if error.errno == errno.EADDRINUSE and address.port is None:
                 continue
-            reason = os.strerror(error.errno) if (error.errno or 0) > 0 else error.strerror or str(error)
+            number = error.errno or 0
+            reason = os.strerror(number) if number > 0 else error.strerror or str(error)
             if error.errno in (errno.EADDRINUSE, errno.EACCES):
                 raise BadInput(
                     f"{address.flags}port {port}: {reason}; give another, or leave it out for a free one"
@@ -173,9 +174,11 @@ def _gated(gate: TokenAuth, listener: socket.socket, script: Script) -> Iterator
     viser has no place for a hook of its own, so that the function by which it opens its port is replaced for as long as
     it takes to start; the list says whether viser has called it.
     """
-    from websockets.asyncio import server as library
+    from websockets.asyncio import server
 
-    plain, used = library.serve, []
+    library: Any = server
+    plain: Callable[..., Any] = library.serve
+    used: list[bool] = []
 
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **settings: Any) -> Any:
         async def answer(connection: Any, request: Any) -> Any:

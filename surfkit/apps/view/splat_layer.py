@@ -45,7 +45,8 @@ class SplatLayer:
     def __init__(self, shelf: SharedCache, client: viser.ClientHandle, pace: DrawPace, count: int) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.count = shelf, client, pace, count
-        self.drawing, self.moves, self.node = threading.Lock(), True, None
+        self.drawing, self.moves = threading.Lock(), True
+        self.node: viser.SceneNodeHandle | None = None
         self.asked: SplatRequest | None = None
         self.has = 0
         self.place, self.places = CameraPose(client), np.zeros(0, np.int64)

@@ -125,9 +125,10 @@ def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Ite
 def of_run(ctx: RunContext, made: Reconstruction) -> ViewerScene:
     """What a finished run holds."""
     run, frame = ctx.run, ctx.scene.frame
-    made, table, mesh = with_drawing(made, ctx.rasterizer), None, None
+    made, table, mesh, levels = with_drawing(made, ctx.rasterizer), None, None, None
     if made.splats is not None and made.splats.primitive.in_ply:
         table = made.splats.primitive.table(made.splats.params).on_cpu()
+        levels = load_levels(run, made.splats) if run.lod_record.exists() else None
     elif made.splats is not None:
         emit(Warned("splats of this primitive cannot be drawn in a browser: photographs, mesh and pictures are shown"))
     if run.mesh.exists() and run.mesh_record.exists():
@@ -147,7 +148,7 @@ def of_run(ctx: RunContext, made: Reconstruction) -> ViewerScene:
         draw=made.draw,
         plan=read_plan(run).plan if plan_file(run).exists() else None,
         textured=textured_mesh(run.out) if mesh is not None else None,
-        levels=load_levels(run, made.splats) if table is not None and run.lod_record.exists() else None,
+        levels=levels,
     )
 
 

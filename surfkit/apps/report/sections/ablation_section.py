@@ -68,8 +68,8 @@ def row_runs(folder: Path, report: Mapping[str, Any]) -> dict[Place, RunFiles]:
         beside = f", {name}" if (name := data_set_name(report, entry)) else ""
         for at, row in enumerate(entry["rows"]):
             runs = row.get("runs")
-            name = value_at(runs[0], "folder") if isinstance(runs, list) and runs else None
-            out = folder / name if isinstance(name, str) else None
+            where = value_at(runs[0], "folder") if isinstance(runs, list) and runs else None
+            out = folder / where if isinstance(where, str) else None
             if out is not None and out.resolve().is_relative_to(folder.resolve()) and (out / "recipe.json").is_file():
                 found[which, at] = read_source(out, f"{at + 1}. {row['label']}{beside}", len(found) + 1)
     return found
@@ -92,7 +92,7 @@ def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, RunFiles], data
     names = _names(rows, "mean")
     cells, dimmed = [], tuple(at for at, row in enumerate(rows) if row.get("given_up"))
     for at, row in enumerate(rows):
-        seeds = row.get("runs") if isinstance(row.get("runs"), list) else []
+        count = len(seeds) if isinstance(seeds := row.get("runs"), list) else 0
         link = runs[at].id("provenance") if at in runs else ""
         label = row["label"] if at not in dimmed else f"({row['label']})"
         failed = row.get("failed")
@@ -101,7 +101,7 @@ def _table(rows: Sequence[Mapping[str, Any]], runs: Mapping[int, RunFiles], data
             note = f"mesh of another program: {file}"
         if isinstance(other := row.get("not_as_named"), str):
             note = f"not run as named: {other}"
-        first = (TableCell(f"{at + 1}. {label}", at, note, link), TableCell(str(len(seeds)), len(seeds)))
+        first = (TableCell(f"{at + 1}. {label}", at, note, link), TableCell(str(count), count))
         cells.append((*first, *(_cell(row, name) for name in names)))
     head = ("row", "seeds", *(quantity(name).label for name in names))
     return TableElement(f"{data_set}: {CAPTION}" if data_set else CAPTION, head, tuple(cells), True, dimmed)

@@ -44,6 +44,7 @@ def _row(run: RunFiles) -> tuple[TableCell, ...]:
         note = f"{value - was:+.{digits}f}" if value is not None and was is not None else ""
         cells.append(numeric(value, f"{value or 0:.{digits}f}", note))
     rates = after.get("fps_before_and_after")
-    both = [number({"fps": rate}, "fps") for rate in rates] if isinstance(rates, list) and len(rates) == 2 else [None]
-    fps = None if None in both else both[1]
-    return (*cells, numeric(fps, f"{fps or 0:.1f}", "" if fps is None else f"{fps - both[0]:+.1f}"))
+    both = [number({"fps": rate}, "fps") for rate in rates] if isinstance(rates, list) else []
+    if len(both) == 2 and both[0] is not None and both[1] is not None:
+        return (*cells, numeric(both[1], f"{both[1]:.1f}", f"{both[1] - both[0]:+.1f}"))
+    return (*cells, numeric(None, ""))

@@ -69,11 +69,15 @@ def charts(parts: Sequence[tuple[str, JournaledStage]], what: Sequence[tuple[str
     return [ElementRow(tuple(found), size="wide")] if found else []
 
 
+def _loss(name: str) -> Value:
+    return lambda line: number(line, "losses", name)
+
+
 def _losses(run: RunFiles) -> list[LineChart]:
     """Each loss of the first stage."""
-    last = next(iter(reversed(run.first.of("StepDone"))), {})
-    names = list(mapping(last, "losses"))
-    series = [(name, run.first.series(lambda line, name=name: number(line, "losses", name))) for name in names]
+    done = run.first.of("StepDone")
+    names = list(mapping(done[-1], "losses")) if done else []
+    series = [(name, run.first.series(_loss(name))) for name in names]
     lines = [ChartSeries(name, dots) for name, dots in series if dots is not None]
     return [chart("Weighted losses, one by one", lines)] if len(lines) > 1 else []
 

@@ -41,8 +41,9 @@ def _stages(run: RunFiles) -> list[Element]:
     for part in run.parts:
         last = next(iter(reversed(part.of("StepDone"))), None)
         if last is not None:
-            points, *held = (number(last, key) or None for key in ("points", "peak_memory_bytes", "peak_gpu_bytes"))
-            rows.append((part.title, seconds_of(part), number(last, "index"), points, *held))
+            keys = ("points", "peak_memory_bytes", "peak_gpu_bytes")
+            points, memory, gpu = (number(last, key) or None for key in keys)
+            rows.append((part.title, seconds_of(part), number(last, "index"), points, memory, gpu))
     for name, data in (("mesh", run.mesh), ("compression", run.compressed)):
         if (took := number(data, "seconds")) is not None:
             rows.append((name, took, None, None, None, None))

@@ -38,9 +38,9 @@ def figures(run: RunFiles) -> dict[str, float]:
 
 def _cell(one: dict[str, float], name: str, first: dict[str, float], at: int) -> TableCell:
     value, what = one.get(name), QUANTITIES[name]
-    has_base = at > 0 and name in first and value is not None
-    note = what.difference(value, first[name]) if has_base else ""
-    return numeric(value, "" if value is None else what.shown(value), note)
+    if value is None:
+        return numeric(None, "")
+    return numeric(value, what.shown(value), what.difference(value, first[name]) if at > 0 and name in first else "")
 
 
 def _parts(run: RunFiles) -> list[tuple[TableCell, ...]]:
