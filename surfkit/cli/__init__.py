@@ -16,6 +16,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from typing import Any
 
 from surfkit.cli.help_cache import HELP_FLAGS, keep, kept_help, show_kept
 from surfkit.cli.standard_streams import (
@@ -204,7 +205,7 @@ def _dispatch(words: list[str]) -> int:
     else:
         command = COMMANDS[name]
     if isinstance(command, LazyCommand):
-        command = importlib.import_module(command.module).COMMAND
+        command = _loaded(name, command)
     if isinstance(command, dict):
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
@@ -215,6 +216,19 @@ def _dispatch(words: list[str]) -> int:
             return 0
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
     return parse(command, rest, f"surfkit {name}").run() or 0
+
+
+def _loaded(name: str, command: LazyCommand) -> Any:
+    """What the module of a command has as `COMMAND`; BadInput where that of a package cannot be loaded."""
+    try:
+        return importlib.import_module(command.module).COMMAND
+    except (ImportError, AttributeError) as error:
+        if name in COMMANDS:
+            raise
+        raise BadInput(
+            f"command {name}: {command.module} of its package cannot be used: {type(error).__name__}: {error}; install "
+            "what it needs (`surfkit plugins` names the package)"
+        ) from error
 
 
 def _meant(word: str, known: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Commands that packages add."""
 
 import importlib
+import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -92,3 +93,37 @@ def test_a_name_that_surfkit_has_is_refused(package, capsys):
     package(offer(mesh=Quiet))
     assert main(["quit"]) == 2
     assert "a command named 'mesh': surfkit (surfkit.apps) and added" in capsys.readouterr().err
+
+
+LAZY = """
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Lazy:
+    \"\"\"Give an exit status.\"\"\"
+
+    def run(self):
+        return 4
+
+
+COMMAND = Lazy
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "said"),
+    [
+        (LAZY, 4, ""),
+        ("import nowhere_to_be_found", 2, "No module named 'nowhere_to_be_found'"),
+        ("MAND = 1", 2, "COMMAND"),
+    ],
+)
+def test_a_module_that_is_loaded_when_its_command_is_given(package, tmp_path, monkeypatch, capsys, text, status, said):
+    (tmp_path / "lazily_loaded.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "lazily_loaded", raising=False)
+    package(offer(lazily=surfkit.LazyCommand("lazily_loaded", "Give an exit status.")))
+    assert main(["lazily"]) == status
+    line = capsys.readouterr().err
+    assert said in line and line.count("\n") == bool(said)
