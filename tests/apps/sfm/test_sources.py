@@ -149,7 +149,7 @@ def test_masks_that_do_not_fit_are_told(folder):
     Image.new("L", (WIDTH, HEIGHT), 255).save(folder / "m/nobody.png")
     with collect_notes() as notes:
         sources_of(folder, masks=folder / "m")
-    assert f"--masks {folder / 'm'}: 1 masks have the name of no photograph: 'nobody.png'" in notes.texts
+    assert any(text.startswith(f"--masks {folder / 'm'}: 1 ") and "'nobody.png'" in text for text in notes.texts)
     Image.new("L", (WIDTH, HEIGHT // 2), 255).save(folder / "m/flight/1.png")
     with pytest.raises(BadInput, match=r"1\.png: 240 x 90 px"):
         sources_of(folder, masks=folder / "m")

@@ -203,7 +203,7 @@ def test_on_the_command_line(farm, tmp_path, capsys):
     assert main([*words, *chosen, "--split.count", "2"]) == 2
     assert "data.split.count 1, and this one has 2" in capsys.readouterr().err
     assert main([*words, "--split", "loest"]) == 2
-    assert "'loest'; did you mean 'lowest'? known: gauu-scene, lowest, wrong, none" in (capsys.readouterr().err)
+    assert "'loest'; did you mean 'lowest'? known: gauu-scene, lowest, wrong, none" in capsys.readouterr().err
     assert main([*words, "--split"]) == 2
     assert "--split: one of gauu-scene, lowest, wrong, none" in capsys.readouterr().err
     assert main(["doctor", str(root), "--quick", *chosen]) in (0, 1)
