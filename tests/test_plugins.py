@@ -95,7 +95,7 @@ def test_a_broken_plugin_is_reported_and_breaks_nothing(world, install, capsys, 
     assert set(components(world.Loss)) == {"l1", "depth"}
     assert [plugin.name for plugin in failures()] == ["broken"]
     assert failures()[0].error.startswith(reason)
-    with pytest.raises(BadInput, match=r"known: depth, l1; plugin broken \(broken-dist 1.0\) is not in use: "):
+    with pytest.raises(BadInput, match=r"known: depth, l1; .*broken \(broken-dist 1\.0\)"):
         find(world.Loss, "l2")
     assert main(["plugins"]) == 0
     assert f"broken-dist  1.0      not in use: {reason}" in capsys.readouterr().out
@@ -158,7 +158,7 @@ def test_narrowing(world, install, monkeypatch, bare):
         assert set(components(world.Loss)) == wanted
     monkeypatch.setenv("SURFKIT_PLUGINS", "acme,blot")
     bare.reload()
-    with pytest.raises(BadInput, match="SURFKIT_PLUGINS: no plugin named 'blot' is installed; installed: acme, bolt"):
+    with pytest.raises(BadInput, match="SURFKIT_PLUGINS: .*'blot' .*installed: acme, bolt"):
         components(world.Loss)
 
 
@@ -196,7 +196,7 @@ def test_two_recipes_of_one_name(world, bare, capsys):
 
     bare.plugins().register(Other(), "other")
     assert main(["recipes"]) == 2
-    assert "two packages offer a recipe named 'discs': stand-in and other" in capsys.readouterr().err
+    assert "recipe named 'discs': stand-in and other" in capsys.readouterr().err
 
 
 class TestCeiling:

@@ -73,7 +73,7 @@ def test_without_any_table_it_is_one_line(monkeypatch, capsys, words):
         monkeypatch.undo()
         registry.reload()
     said = capsys.readouterr().err
-    assert said.startswith("surfkit: no plugin in use offers an ablation table; name a file") and said.count("\n") == 1
+    assert said.startswith("surfkit: no plugin in use offers an ablation table") and said.count("\n") == 1
 
 
 def test_help(capsys):
@@ -130,7 +130,7 @@ def test_a_failing_row_is_exit_status_1(scene, monkeypatch, tmp_path, capsys):
     words = ["table:gradient", "--data", str(scene), "--steps", "2", "--rows", "1", "4", "--out", str(tmp_path)]
     assert main(["ablate", *words, "--probe", "0"]) == 1
     captured = capsys.readouterr()
-    assert "surfkit: SSIM + RGB + normal: failed: seed 0: MemoryError: out of memory; see " in captured.err
+    assert "SSIM + RGB + normal: failed: seed 0: MemoryError" in captured.err
     assert re.search(r"^4 +SSIM +1 +1/1 +\d", captured.out, re.M)
 
 
@@ -171,10 +171,8 @@ def test_missing_depth_maps_are_told_once_before_the_table(scene, tmp_path, caps
     said = capsys.readouterr().err
     first = said.partition("run 1 of 1:")[0]
     make = f"make them with `surfkit prepare depth {scene}`"
-    assert first == (
-        f"note: {scene} has no depth priors, so everything that learns from them is switched off, such as the losses "
-        f"depth and normal-prior, in row 2; {make}\n"
-    )
+    assert first.startswith(f"note: {scene} has no depth priors") and first.count("\n") == 1
+    assert first.endswith(f"depth and normal-prior, in row 2; {make}\n")
     kept = json.loads((tmp_path / "out" / "ablation.json").read_text())["data_sets"][0]["notes"]
     assert [note["rows"] for note in kept if note["text"].endswith(make)] == [["depth 0.1"]]
     page = (tmp_path / "out" / "ablation.md").read_text()
@@ -187,7 +185,8 @@ def test_rows_that_nothing_can_measure_are_named(scene, tmp_path, capsys):
     (tmp_path / "mine.json").write_text(json.dumps({"name": "mine", "base": "stereo", "rows": rows}))
     words = [str(tmp_path / "mine.json"), "--data", str(scene), "--out", str(tmp_path / "out")]
     assert main(["ablate", *words]) == 0
-    assert capsys.readouterr().err == "note: nothing compares meshes without --gt, so left out: all rows, fused\n"
+    said = capsys.readouterr().err
+    assert "without --gt" in said and said.endswith(": all rows, fused\n") and said.count("\n") == 1
 
 
 def test_nothing_is_made_to_show_a_table_without_runs(scene, monkeypatch, tmp_path, capsys):

@@ -105,11 +105,11 @@ def test_mistakes_are_one_line(given, here, capsys):
     table.quats[2] = 0
     write_splats(here / "zero.ply", table)
     line = one_line(["import", "zero.ply", "--data", data], capsys)
-    assert "1 of 250 splats have a rotation of length 0, splat 2 is the first" in line
+    assert "rotation of length 0, splat 2" in line
     line = one_line(["train", "recipe:import", "--method.file", path, "--data", data, "--steps", "5"], capsys)
     assert "method:import makes no optimisation steps" in line
     line = one_line(["train", "recipe:2dgs", "start:splats", "--data", data], capsys)
-    assert "start.file is not set; name a file of splats with --start.file FILE" in line
+    assert "--start.file FILE" in line
     assert not (here / "runs").exists()
 
 

@@ -166,12 +166,12 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     assert main(["prepare", "depth", str(farm), *SMALL, "--estimator.window", "7"]) == 2
     assert "made with other settings" in capsys.readouterr().err
     assert main(["prepare", "depth", str(farm), *SMALL, "--scale", "2"]) == 2
-    assert "made of other photographs, or of other sizes; --again" in capsys.readouterr().err
+    assert "or of other sizes; --again" in capsys.readouterr().err
     record = path.with_name("depth.json")
     whole = json.loads(record.read_text())
     record.write_text(json.dumps({key: value for key, value in whole.items() if key != "made_from"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
-    assert "by an earlier surfkit, which did not note of which cameras; --again" in capsys.readouterr().err
+    assert "of which cameras; --again" in capsys.readouterr().err
     record.write_text(json.dumps({key: value for key, value in whole.items() if key != "photographs"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0, "of before contents were noted"
     assert json.loads(record.read_text()) == whole
@@ -196,7 +196,7 @@ def test_maps_of_photographs_that_were_replaced_are_refused(farm, capsys):
     turned.save(photo)
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     told = capsys.readouterr().err
-    assert "holds depth maps made before 'view_001.png' was changed, or replaced by other photographs of the" in told
+    assert "made before 'view_001.png' was changed" in told
     assert maps(farm) == first
     assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 0
     assert maps(farm)["view_001.png.npy"] != first["view_001.png.npy"]

@@ -92,7 +92,7 @@ def test_what_is_no_command_is_told_and_not_in_use(package, wrong, capsys):
 def test_a_name_that_surfkit_has_is_refused(package, capsys):
     package(offer(mesh=Quiet))
     assert main(["quit"]) == 2
-    assert "a command named 'mesh': surfkit (surfkit.apps) and added" in capsys.readouterr().err
+    assert "'mesh': surfkit (surfkit.apps) and added" in capsys.readouterr().err
 
 
 LAZY = """

@@ -91,7 +91,7 @@ def test_a_file_written_again_is_the_same(tmp_path, name, places):
 
 @pytest.mark.parametrize("places", [np.full((3, 3), np.nan), np.full((3, 3), np.inf), np.full((3, 3), 1e300)])
 def test_places_that_are_none_are_refused(places):
-    with pytest.raises(BadInput, match=r"positions that are NaN, Inf or beyond 2\^200"):
+    with pytest.raises(BadInput, match=r"positions .*beyond 2\^200"):
         list(leaves(places))
 
 
@@ -190,11 +190,11 @@ def test_float16_and_lossless(tmp_path):
     for name in ("scales", "quats", "opacities", "sh0", "sh_rest"):
         assert torch.equal(before[name].half().float(), after.params[name]), name
     model.params["sh0"][7] = 1e6
-    with pytest.raises(BadInput, match="sh0: values beyond what float16 holds; choose compress:lossless"):
+    with pytest.raises(BadInput, match="sh0: .*float16.*compress:lossless"):
         returned(tmp_path, model, Float16())
 
 
 def test_steps_that_floats_do_not_tell_apart_are_refused(tmp_path):
     model = splat_model(Gaussian3D(sh_degree=0), 20)
-    with pytest.raises(BadInput, match=r"scales: values of more than 2\^22 steps; take longer steps, or compress:floa"):
+    with pytest.raises(BadInput, match=r"scales: .*2\^22 steps.*compress:float"):
         returned(tmp_path, model, Packed(scale=1e-8))

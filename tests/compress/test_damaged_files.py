@@ -271,7 +271,7 @@ def test_other_files(tmp_path):
 
 def test_newer_versions(tmp_path, whole):
     newer = whole[:8] + struct.pack("<I", 2) + whole[12:]
-    assert "version 2 of the format; this surfkit reads version 1; install a newer one" in complaint(tmp_path, newer)
+    assert "version 2 of the format; this surfkit reads version 1" in complaint(tmp_path, newer)
 
 
 READ = """
@@ -326,7 +326,7 @@ def test_streams_come_back():
     assert list(found) == list(streams)
     for name, numbers in streams.items():
         assert np.array_equal(found[name].numbers(), numbers) and found[name].dtype == numbers.dtype
-    with pytest.raises(BadInput, match="stream 'long zeros' has 200000 x 1 numbers"):
+    with pytest.raises(BadInput, match="'long zeros' has 200000 x 1"):
         unpacked(packed(streams), 199_999)
     with pytest.raises(TypeError, match="must be unsigned"):
         packed({"x": np.zeros((2, 2), np.int32)})

@@ -44,7 +44,7 @@ def test_codes(parts):
     cuts = enumerate(zip(ends[:-1], ends[1:], strict=True))
     tables = {f"sh.codes.{at}": np.unique(numbers[:, a:b], axis=0) for at, (a, b) in cuts}
     check_encoding(Codes(parts), columns, tables, {CHOSEN_MARK: torch.arange(200) % 3 == 0}, near=1e-3)
-    with pytest.raises(BadInput, match="codebooks are missing, or not of 12 coefficients together"):
+    with pytest.raises(BadInput, match="codebooks .*12 coefficients"):
         check_encoding(Codes((11,)), columns, tables, {CHOSEN_MARK: torch.arange(200) % 3 == 0})
 
 

@@ -375,27 +375,27 @@ def with_value(value):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: kmeans(with_value(float("nan")), 2), "vectors: row 7 has the value nan; values must be finite"),
-        (lambda: kmeans(with_value(float("inf")), 2), "vectors: row 7 has the value inf; values must be finite"),
-        (lambda: kmeans(with_value(-1e16), 2), "vectors: row 7 has the value -1e[+]16; .* at most 1e[+]15"),
+        (lambda: kmeans(with_value(float("nan")), 2), "vectors: row 7 .*nan; .*finite"),
+        (lambda: kmeans(with_value(float("inf")), 2), "vectors: row 7 .*inf; .*finite"),
+        (lambda: kmeans(with_value(-1e16), 2), "vectors: row 7 .*-1e[+]16; .*1e[+]15"),
         (lambda: kmeans(clustered(10, 3).double(), 2), "vectors: expected float32, got float64"),
         (lambda: kmeans(torch.zeros(10), 2), r"vectors: expected shape \(N, D\), got \(10,\)"),
-        (lambda: kmeans(torch.zeros(10, 0), 2), r"vectors: expected at least one column, got \(10, 0\)"),
+        (lambda: kmeans(torch.zeros(10, 0), 2), r"vectors: .*one column, got \(10, 0\)"),
         (lambda: kmeans(clustered(10, 3), 2, torch.ones(9)), r"weights: expected shape \(10,\), got \(9,\)"),
         (
             lambda: kmeans(clustered(2, 3), 2, torch.tensor([1, -1.0])),
-            "weights: row 1 has the value -1; .* not negative",
+            "weights: row 1 .*-1; .*negative",
         ),
         (lambda: kmeans(clustered(2, 3), 2, torch.tensor([torch.nan, 1])), "weights: row 0 has the value nan"),
-        (lambda: kmeans(clustered(10, 3), 0), "codes is 0; it must be at least 1"),
-        (lambda: kmeans(clustered(10, 3), 2, iterations=-1), "iterations is -1; it must be at least 0"),
-        (lambda: kmeans(clustered(10, 3), 5, sample=4), "sample is 4; it must be at least 5"),
+        (lambda: kmeans(clustered(10, 3), 0), "codes is 0; .*1"),
+        (lambda: kmeans(clustered(10, 3), 2, iterations=-1), "iterations is -1; .*0"),
+        (lambda: kmeans(clustered(10, 3), 5, sample=4), "sample is 4; .*5"),
         (
             lambda: nearest(clustered(5, 3), clustered(5, 4)),
             r"codebook: expected shape \(K, D\) with D = 3, got \(5, 4\)",
         ),
         (lambda: nearest(clustered(5, 3), with_value(float("nan"))), "codebook: row 7 has the value nan"),
-        (lambda: nearest(clustered(5, 3), torch.zeros(0, 3)), "codebook: it has no codes, and there are 5 vectors"),
+        (lambda: nearest(clustered(5, 3), torch.zeros(0, 3)), "codebook: .*no codes.* 5 vectors"),
     ],
 )
 def test_bad_input_is_named(call, message):

@@ -115,7 +115,7 @@ def test_models_of_every_kind(tmp_path, compressor, primitive, count):
     degree = {Surfel2D: 3, Gaussian3D: 1, Flat3D: 2}.get(primitive, 0)
     model = splat_model(primitive(sh_degree=degree), count)
     if primitive is Bare and isinstance(compressor, Vectree):
-        with pytest.raises(BadInput, match="compress:vectree needs the columns sh0 and sh_rest; choose compress:pack"):
+        with pytest.raises(BadInput, match="vectree needs .*sh0 .*sh_rest.*compress:pack"):
             write(tmp_path / "m.surfkit", model, compressor)
         return
     assert_complete(tmp_path / "m.surfkit", model, compressor)
@@ -207,7 +207,7 @@ def test_leaves_are_read_one_by_one(tmp_path):
         low, high = (torch.from_numpy(corner) for corner in file.box(at))
         assert ((low <= found["means"]) & (found["means"] <= high)).all()
         other = (at + 1) % len(entries)
-        with pytest.raises(BadInput, match=rf"m.surfkit: leaf {other} of {len(entries)}: damaged \(checksum\); copy"):
+        with pytest.raises(BadInput, match=rf"m.surfkit: leaf {other} of {len(entries)}: .*checksum"):
             file.leaf(other)
         with pytest.raises(BadInput, match="leaf"):
             file.read()
@@ -227,7 +227,7 @@ def test_frames_come_back(tmp_path):
 def test_columns_that_no_encoding_takes(tmp_path):
     model = splat_model(Surfel2D(sh_degree=0), 30)
     plan = Lossless().plan(model, None, 0)
-    with pytest.raises(BadInput, match="column means must be taken by one encoding; they take scales"):
+    with pytest.raises(BadInput, match="means must .*one encoding.*scales"):
         write(tmp_path / "m.surfkit", model, Lossless(), Plan(plan.encodings[1:]))
 
 
@@ -243,6 +243,6 @@ def test_coarser_files_are_smaller(tmp_path):
     model = splat_model(Surfel2D(), 400)
     sizes = [len(write(tmp_path / "m.surfkit", model, Packed().coarser(factor))) for factor in (0.25, 1, 4)]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.2 * sizes[2]
-    with pytest.raises(BadInput, match="compress:lossless has no setting for size against loss; choose compress:pack"):
+    with pytest.raises(BadInput, match="compress:lossless has no .*compress:pack"):
         Lossless().coarser(2)
     assert Packed().coarser(1.0) == Packed() == replace(Packed())

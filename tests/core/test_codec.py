@@ -124,7 +124,7 @@ def test_json_may_be_nested_as_deep_as_is_said_and_no_deeper(tmp_path):
         assert dump(read_json(path, Any))
         for depth in (MAX_NESTING_DEPTH + 1, 900, 100_000):
             path.write_text(left * depth + "1" + right * depth)
-            with pytest.raises(BadInput, match="r.json: not JSON: nested too deeply"):
+            with pytest.raises(BadInput, match="r.json: .*nested too"):
                 read_json(path, Any)
 
 

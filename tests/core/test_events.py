@@ -40,4 +40,5 @@ def test_everyone_hears_and_a_broken_listener_is_left_out(bare, capsys):
     assert first.heard == last.heard == events
     assert (broken.calls, deaf.calls) == (1, 3)
     said = capsys.readouterr().err
-    assert said == "surfkit: plugin broken failed at StepDone and gets no more events: RuntimeError: no disk\n"
+    assert said.startswith("surfkit: plugin broken failed at StepDone") and said.endswith(": RuntimeError: no disk\n")
+    assert said.count("\n") == 1

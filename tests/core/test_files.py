@@ -175,7 +175,7 @@ def test_without_a_home_folder_the_user_is_told_what_to_set(monkeypatch, tmp_pat
     for name in ("SURFKIT_CACHE", "XDG_CACHE_HOME", "HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as it does for a user without a name
-    with pytest.raises(BadInput, match="HOME is not set.* set HOME, or SURFKIT_CACHE"):
+    with pytest.raises(BadInput, match="HOME .*SURFKIT_CACHE"):
         cache_root()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_root() == tmp_path / "surfkit"

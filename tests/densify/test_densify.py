@@ -162,7 +162,7 @@ def test_a_split_threshold_clones_by_the_signed_gradient_and_splits_by_the_other
 
 def test_a_split_threshold_needs_absolute_gradients():
     recipe = replace(recipes()["3dgs"], pretrain=Stage(densify=ADC(split_threshold=4e-4)))
-    with pytest.raises(BadInput, match="pretrain.densify: adc needs absolute pixel gradients.*signal:abs-gradient"):
+    with pytest.raises(BadInput, match="pretrain.densify: adc .*signal:abs-gradient"):
         recipe.refuse_unfit()
     recipes()["absgs"].refuse_unfit()
     with pytest.raises(BadInput, match="densify.split_threshold is 0"):

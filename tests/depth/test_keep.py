@@ -112,7 +112,7 @@ def test_a_cache_that_can_only_be_read_is_used(farm, own_cache, monkeypatch):
             pass
         assert {path: path.stat().st_mtime_ns for path in own_cache.rglob("*")} == before
         (folder_of("some") / "estimated_depths/view_001.png.npy").unlink()
-        with pytest.raises(ValueError, match="cannot be written .Read-only file system.; set SURFKIT_CACHE"):
+        with pytest.raises(ValueError, match="Read-only file system.*SURFKIT_CACHE"):
             made(farm)
 
 
@@ -126,7 +126,7 @@ def test_a_full_disk_is_one_line_and_the_maps_stay(farm, own_cache, monkeypatch)
 
     with monkeypatch.context() as patch:
         patch.setattr(PatchMatch, "estimate", full)
-        with pytest.raises(Fault, match="^some.npy: the disk is full .*; free some space, .*SURFKIT_CACHE") as error:
+        with pytest.raises(Fault, match="^some.npy: the disk is full .*SURFKIT_CACHE") as error:
             made(farm)
     assert "\n" not in str(error.value) and len(list(own_cache.rglob("*png.npy"))) == 1
     assert made(farm) == (7, [])
@@ -134,7 +134,7 @@ def test_a_full_disk_is_one_line_and_the_maps_stay(farm, own_cache, monkeypatch)
 
 def test_maps_larger_than_the_budget_are_told(farm, own_cache):
     count, (told,) = made(farm, budget=1_000)
-    assert count == 7 and told.endswith("GB, more than the 1e-06 GB of --prepare-cache, and are kept")
+    assert count == 7 and told.endswith("more than the 1e-06 GB of --prepare-cache, and are kept")
     assert made(farm, budget=1_000) == (7, []), "told when they were made"
 
 

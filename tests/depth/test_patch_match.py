@@ -514,7 +514,7 @@ def test_small_photographs_among_larger_ones_do_not_refuse_the_window(farm, tmp_
         assert estimate.inverse.shape == estimate.confidence.shape == (camera.height, camera.width)
         assert torch.isfinite(estimate.inverse).all() and torch.isfinite(estimate.confidence).all()
         assert float((estimate.confidence > 0.5).float().mean()) > 0.03 or estimate.at in sizes
-    with pytest.raises(BadInput, match="the largest depth map, of view_000.png, is 40 x 4 pixels: .* 3 to 4"):
+    with pytest.raises(BadInput, match="view_000.png, is 40 x 4 .* 3 to 4"):
         estimator.refuse_unfit(views[:3])
 
 
@@ -535,7 +535,7 @@ def test_a_scale_is_a_share_of_each_photograph_and_the_longest_side_still_counts
     assert sides(PatchMatch(scale=2).of_map(whole.resized(4001, 3000))) == (1600, 1200)
     assert sides(PatchMatch(scale=4).of_map(whole.resized(4001, 3000))) == (1000, 750)
     assert sides(PatchMatch(scale=1000).of_map(whole)) == (1, 1)
-    with pytest.raises(BadInput, match=r"window is 7, and the largest depth map, of view_0.*, is 7 x 5 pixels"):
+    with pytest.raises(BadInput, match="window is 7, .*view_0.* 7 x 5"):
         PatchMatch(scale=18).refuse_unfit(scene.train)
 
 

@@ -184,7 +184,7 @@ def test_a_given_transform_and_crop(tmp_path):
     assert f1(outcome) == (1, 1, 1) and len(outcome.draws[0].truth) == 30 * 30
     assert np.array_equal(outcome.draws[0].alignment.matrix, matrix)
     write_crop(tmp_path / "c.json", Crop(np.array([[0.0, 0], [1, 0], [1, 1]]), 0, 1))
-    with pytest.raises(BadInput, match="0 points of the reconstruction inside the crop volume.*--transform.*--crop"):
+    with pytest.raises(BadInput, match="0 points .*--transform.*--crop"):
         compare(surface(lattice()), truth, settings)
 
 
@@ -217,7 +217,7 @@ def test_a_rough_fit_is_told(told):
 def test_half_of_all_far_off_is_another_frame():
     draw = np.random.default_rng(0)
     ours = draw.uniform(-30, 30, (4_000, 3))
-    with pytest.raises(BadInput, match="another frame or unit.*ICP residual.*give --transform"):
+    with pytest.raises(BadInput, match="ICP residual.*--transform"):
         compare(surface(ours), surface(lattice() * [8, 8, 1] - [24, 24, 0]), still(tau=0.1, align="similarity"))
 
 
@@ -245,7 +245,7 @@ def test_a_preset_is_in_metres_and_gives_way_to_options():
     assert found.voxel == pytest.approx(0.007)  # two units of the truth are 100 m
     own = Comparison(preset="matrixcity-street", voxel=0.1, visible=0.5, tau=0.4)
     assert own.for_scene(None, matrix) == replace(own, preset=None)
-    with pytest.raises(BadInput, match="--preset gauu-modern: the truth is thinned to voxels of 0.35 m.*--metres-per"):
+    with pytest.raises(BadInput, match="--preset gauu-modern: .*0.35 m.*--metres-per"):
         Comparison(preset="gauu-modern").for_scene(Frame(np.zeros(3), 1.0), matrix)
 
 

@@ -115,7 +115,7 @@ def test_bad_points_with_lists(tmp_path):
     with pytest.raises(BadInput, match="counts its numbers with float"):
         read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, "float"))
     for line, message in {
-        "property list uchar int a": "do not come before 'property list uchar int a'",
+        "property list uchar int a": "'property list uchar int a'",
         "property half a": "cannot read 'property half a' of a vertex",
         "property float x": "or one twice: x, x",
     }.items():
@@ -125,13 +125,13 @@ def test_bad_points_with_lists(tmp_path):
     whole = path.read_bytes()
     for line in (b"property list uchar double", b"property list half double weights", b"property list"):
         path.write_bytes(whole.replace(b"property list uchar double weights", line))
-        with pytest.raises(BadInput, match="cannot read 'property list.* of a vertex"):
+        with pytest.raises(BadInput, match="'property list.* of a vertex"):
             read_surface(path)
     path.write_bytes(whole.replace(b"end_header", b"comment"))
     with pytest.raises(BadInput, match="the PLY header does not end"):
         read_surface(path)
     path.write_bytes(whole.replace(b"element vertex 6", b"element camera 6"))
-    with pytest.raises(BadInput, match="the first element must be 'element vertex N'"):
+    with pytest.raises(BadInput, match="first .* 'element vertex N'"):
         read_surface(path)
 
 

@@ -141,9 +141,9 @@ def test_crops(tmp_path):
     inside = read_crop(path).inside(points)
     x, y, z = points.T
     assert np.array_equal(inside, (abs(y) <= 3) & (x > 3) & (x < 7) & (z > -2) & (z < x - 5)) and inside.sum() > 20
-    with pytest.raises(BadInput, match="outside the crop: is it in the frame of the input"):
+    with pytest.raises(BadInput, match="outside the crop"):
         clean(mesh, 50, 50, box((50, 50, 50, 60, 60, 60)).inside)
-    with pytest.raises(BadInput, match="--crop-box 1 0 0 0 1 1: give the lowest"):
+    with pytest.raises(BadInput, match="--crop-box 1 0 0 0 1 1: .*lowest"):
         box((1, 0, 0, 0, 1, 1))
     for text in ("{", "[]", '{"orthogonal_axis": "W"}', json.dumps(volume | {"bounding_polygon": [[1, 2, 3]]})):
         path.write_text(text)

@@ -39,9 +39,9 @@ def test_an_oversized_splat_is_as_if_it_were_not_there():
 
 def test_what_cannot_be_left_out_is_one_line():
     ball, both = with_disc()
-    with pytest.raises(BadInput, match="largest_px 0.1: all 601 splats are larger; give more, or 0"):
+    with pytest.raises(BadInput, match="largest_px 0.1: all 601 .*or 0"):
         TSDF(largest_px=0.1).mesh(both)
-    with pytest.raises(BadInput, match="what is drawn here is not made of splats; give 0"):
+    with pytest.raises(BadInput, match="not made of splats; give 0"):
         TSDF(largest_px=10).mesh(replace(ball, draw_of=None))
     with pytest.raises(BadInput, match="mesh.largest_px is -1"):
         TSDF(largest_px=-1)

@@ -119,7 +119,7 @@ def test_where_there_is_nothing_to_do():
 
 def test_without_kernels_it_is_refused(monkeypatch):
     monkeypatch.setattr("surfkit.mesh.simplify.module", lambda: None)
-    with pytest.raises(BadInput, match="simplifying a mesh needs the compiled kernels"):
+    with pytest.raises(BadInput, match="needs the compiled kernels"):
         simplified(relief(), most=10)
 
 

@@ -63,9 +63,7 @@ def test_priors_alone_give_the_surface_and_photographs_its_colours():
 def test_what_is_not_confident_is_left_out():
     cameras = around(20)
     given = stereo_subject(cameras, confidence=0.3)
-    with pytest.raises(
-        BadInput, match="none of 20 views has a depth prior of confidence 0.375.*min_confidence of mesh:stereo"
-    ):
+    with pytest.raises(BadInput, match="20 views .*0.375.*min_confidence of mesh:stereo"):
         Stereo().mesh(given)
     assert len(Stereo(min_confidence=0.3).mesh(given).faces) > 1000
 
@@ -80,5 +78,5 @@ def test_views_without_a_prior_tell_nothing():
 def test_without_priors_it_says_how_to_make_them():
     with pytest.raises(BadInput, match="surfkit prepare depth"):
         Stereo().mesh(stereo_subject(around(4), priors=None))
-    with pytest.raises(BadInput, match="min_confidence is 0; it must be more than 0"):
+    with pytest.raises(BadInput, match="min_confidence is 0; .*more than 0"):
         Stereo(min_confidence=0)

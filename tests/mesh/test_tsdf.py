@@ -237,19 +237,19 @@ def test_progress_is_told():
 def test_what_cannot_be_meshed_is_said():
     given = subject(around(5), sphere)
     empty = Maps(*[torch.zeros(shape) for shape in ((3, 72, 96), (72, 96), (72, 96), (72, 96), (3, 72, 96))])
-    with pytest.raises(BadInput, match="no depth in any of 5 views.*--mesh.depth expected"):
+    with pytest.raises(BadInput, match="5 views.*--mesh.depth expected"):
         TSDF().mesh(replace(given, draw=lambda view: empty))
     with pytest.raises(BadInput, match="no surface.*--mesh.least-views"):
         TSDF(voxel=1.0, least_views=900).mesh(given)
     with pytest.raises(BadInput, match="no surface"):
         TSDF(voxel=1.0, depth_limit=100.0).mesh(replace(given, draw=lambda view: empty))
-    with pytest.raises(BadInput, match="5 m cannot be used.*--metres-per-unit"):
+    with pytest.raises(BadInput, match="5 m .*--metres-per-unit"):
         TSDF(voxel=5.0).mesh(replace(given, frame=replace(given.frame, metres=None)))
-    with pytest.raises(BadInput, match=r"million triangles, which take .* GB.*--mesh.voxel 0\.\d+ m or more"):
+    with pytest.raises(BadInput, match=r"million triangles.* GB.*--mesh.voxel 0\.\d+ m"):
         TSDF(voxel=0.003).mesh(replace(given, budget_bytes=200_000_000))
-    with pytest.raises(BadInput, match="too small for a scene of .* m; give .* m or more"):
+    with pytest.raises(BadInput, match="too small .* m; give .* m"):
         TSDF(voxel=1e-5, depth_limit=100.0).mesh(given)
-    with pytest.raises(BadInput, match="truncation is 1 m with voxels of 1 m.*1.75 voxels"):
+    with pytest.raises(BadInput, match="truncation is 1 m .*1 m.*1.75"):
         TSDF(voxel=1.0, truncation=1.0).mesh(given)
     with pytest.raises(BadInput, match="1 MB are too little"):
         TSDF().mesh(replace(given, budget_bytes=1_000_000))

@@ -218,8 +218,8 @@ def test_too_little_memory_is_told(monkeypatch):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"cell_px": 0.0}, "mesh.cell_px is 0; it must be from 0.1 to 100"),
-        ({"area": -1.0}, "mesh.area is -1; it must be from 0.001 to 1000"),
+        ({"cell_px": 0.0}, "mesh.cell_px is 0; .*0.1 to 100"),
+        ({"area": -1.0}, "mesh.area is -1; .*0.001 to 1000"),
         ({"cell": -1.0}, "mesh.cell"),
     ],
 )
@@ -229,7 +229,7 @@ def test_settings_that_are_refused(change, said):
 
 
 def test_cells_that_cannot_be_numbered_are_refused():
-    with pytest.raises(BadInput, match=r"mesh.cell is 1e-06 m, too small for a scene of .* m; give .* or more"):
+    with pytest.raises(BadInput, match="mesh.cell is 1e-06 m, .* m; give"):
         replace(PLAIN, cell=1e-6).mesh(subject(CAMERAS, sphere))
 
 

@@ -52,12 +52,12 @@ def test_without_metres_the_longer_side_has_as_many_cells_as_asked_for():
 
 
 def test_lengths_that_do_not_fit():
-    with pytest.raises(BadInput, match="square-grid.side: a length of 100 m cannot be used.*--metres-per-unit"):
+    with pytest.raises(BadInput, match="square-grid.side: .*100 m .*--metres-per-unit"):
         SquareGrid(side=100.0).refuse_unfit(Frame(np.zeros(3), 1.0))
     SquareGrid(side=100.0).refuse_unfit(Frame(np.zeros(3), 1.0, metres=2.0))
     SquareGrid().refuse_unfit(Frame(np.zeros(3), 1.0))
     tiny = under([(0.0, 0.0), (1.0, 1.0)], frame=Frame(np.zeros(3), 1.0, metres=1.0))
-    with pytest.raises(BadInput, match="side 0.001 makes 1,200 x 1,200 cells, and at most 10,000"):
+    with pytest.raises(BadInput, match="side 0.001 .*1,200 x 1,200.* 10,000"):
         SquareGrid(side=0.001).cells(tiny)
     with pytest.raises(BadInput, match="stand in one place"):
         SquareGrid().cells(under([(0.5, 0.5)] * 4))
@@ -182,7 +182,7 @@ def test_a_data_set_without_observations_is_refused_before_it_is_trained(tmp_pat
     stage = Stage(steps=4)
     recipe = Recipe(pretrain=stage, partition=SquareGrid(), assign=SparsePointShare(points=5, few=1), tune=stage)
     write_colmap(tmp_path / "without", truth)
-    with pytest.raises(BadInput, match="without: assign sparse-points needs the sparse points.*has none"):
+    with pytest.raises(BadInput, match="without: assign sparse-points .*none"):
         run(recipe, Data(tmp_path / "without"), tmp_path / "run", Compute("cpu"))
     assert not (tmp_path / "run" / "pretrain").exists()
     with pytest.raises(BadInput, match="100 m cannot be used"):

@@ -35,13 +35,13 @@ def test_take_moves_every_column_with_its_row():
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (Edit(drop=torch.ones(6)), r"edit: drop is torch.float32 of shape \(6,\); it must be bool of shape \(6,\)"),
+        (Edit(drop=torch.ones(6)), r"drop is torch.float32 of shape \(6,\); .*bool of shape \(6,\)"),
         (Edit(drop=torch.ones(6, dtype=torch.int64)), "drop is torch.int64"),
         (Edit(split=torch.tensor([2, 5])), r"split is torch.int64 of shape \(2,\)"),
-        (Edit(clone=mask(1, count=5)), r"clone is torch.bool of shape \(5,\); it must be bool or int64 of shape"),
-        (Edit(move=torch.ones(6)), r"move is .* it must be float32 or float64 of shape \(6, 3\)"),
+        (Edit(clone=mask(1, count=5)), r"clone is torch.bool of shape \(5,\); .*bool or int64"),
+        (Edit(move=torch.ones(6)), r"move is .*float32 or float64 of shape \(6, 3\)"),
         (Edit(opacities=0.5), "opacities is float; it must be"),
-        (mask(1), "edit gives Tensor; it must be a surfkit.Edit, or None"),
+        (mask(1), "edit gives Tensor; .*surfkit.Edit"),
     ],
 )
 def test_what_a_policy_gives_must_fit_the_points(asked, message):

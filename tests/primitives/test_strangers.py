@@ -265,7 +265,7 @@ def test_sizes_that_are_known_with_the_points_only_are_for_shared_columns():
     assert shared.fits((7, 3), 5) and shared.fits((0, 3), 5)
     assert not shared.fits((7, 2), 5) and not shared.fits((3,), 5)
     assert Column((3,), LearningRate(0.0)).fits((5, 3), 5) and not Column((3,), LearningRate(0.0)).fits((7, 3), 5)
-    with pytest.raises(BadInput, match="only that of a shared parameter may have None"):
+    with pytest.raises(BadInput, match="shared parameter .*None"):
         Column((None, 3), LearningRate(0.0))
 
 
@@ -291,7 +291,7 @@ def test_one_word_swaps_the_primitive(source, tmp_path, name, capsys):
     assert set(state.points.all_params()) == set(registry.components(Primitive)[name]().columns())
     if name == "pairs":
         assert state.points.shared["net"].abs().max() > 0.05, "the network learns"
-        assert "no point_cloud.ply: PLY files of splats have no place for pairs" in notes(tmp_path / "whole")
+        assert any("no point_cloud.ply" in text and "pairs" in text for text in notes(tmp_path / "whole"))
 
 
 def test_a_network_goes_on_as_if_nothing_had_happened(source, tmp_path):
@@ -347,9 +347,9 @@ def test_blocks_with_a_network_are_merged_by_the_stated_rule(source, tmp_path):
 
 def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_path, capsys):
     assert train(source, tmp_path / "a", "recipe:3dgs", "primitive:pairs", "refine.0:distil") == 2
-    assert "refine.0: distil cuts the column sh_rest, which primitive pairs does not have" in capsys.readouterr().err
+    assert "refine.0: distil cuts the column sh_rest" in capsys.readouterr().err
     assert not (tmp_path / "a" / "pretrain").exists()
-    with pytest.raises(BadInput, match=r"pretrain.rates.wings: primitive surfel2d has no such column; it has means"):
+    with pytest.raises(BadInput, match="pretrain.rates.wings: .*surfel2d .*means"):
         recipe = surfkit.Recipe(pretrain=surfkit.Stage(rates={"wings": LearningRate(1.0)}))
         recipe.refuse_unfit()
 
@@ -357,11 +357,11 @@ def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_pat
 def test_absolute_gradients_that_torch_does_not_have_are_refused(source, tmp_path, capsys):
     assert train(source, tmp_path / "a", "recipe:absgs", "primitive:drawn") == 2
     told = capsys.readouterr().err
-    assert "pretrain.signal: abs-gradient wants absolute pixel gradients, and primitive drawn draws itself" in told
+    assert "pretrain.signal: abs-gradient wants" in told
     assert "choose pretrain.signal:loss-gradient" in told and not (tmp_path / "a" / "pretrain").exists()
     words = "recipe:absgs", "primitive:drawn", "pretrain.signal:loss-gradient"
     assert train(source, tmp_path / "b", *words) == 2
-    assert "pretrain.densify: adc needs absolute pixel gradients, and signal loss-gradient" in capsys.readouterr().err
+    assert "adc needs absolute pixel gradients, and signal loss-gradient" in capsys.readouterr().err
     words = *words, "--pretrain.densify.split-threshold", "None"
     assert train(source, tmp_path / "b", *words, "--pretrain.steps", "2") == 0
 
@@ -375,7 +375,7 @@ def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
     )
     camera = Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 8.0, 8.0, 16, 16)
     for name in ("native", "reference"):
-        with pytest.raises(BadInput, match="splats of kind 'anchor': the rasterizers draw surfels and gaussians"):
+        with pytest.raises(BadInput, match="'anchor': .*surfels and gaussians"):
             select(name)[0].render(splats, camera, 0.01)
 
 
@@ -393,7 +393,7 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     own = AutogradRender(splats, camera, lambda s: draw(s, camera, 0.01).maps, true.seen, true.radii)
     cotangent = type(true.maps)(color=torch.randn(3, 16, 16))
     a, b = true.backward(cotangent, cotangent), own.backward(cotangent, cotangent)
-    with pytest.raises(BadInput, match="absolute pixel gradients cannot be had .* choose signal:loss-gradient"):
+    with pytest.raises(BadInput, match="absolute .*signal:loss-gradient"):
         own.backward(cotangent, cotangent, absolute=True)
     for name, value in a.tensors().items():
         assert torch.allclose(value, b.tensors()[name], atol=1e-6), name
@@ -440,7 +440,7 @@ def begun(stage, primitive, scene):
 
 def test_pictures_of_another_size_are_refused_in_one_line(source):
     trainer, state = begun(Stage(steps=2), Small(), read(Data(source)))
-    with pytest.raises(BadInput, match=r"primitive small: its render gives color of shape \(3, 30, 20\) for a view of"):
+    with pytest.raises(BadInput, match=r"small: .*color of shape \(3, 30, 20\)"):
         trainer.step(state)
 
 
@@ -460,7 +460,7 @@ def test_pictures_of_another_size_are_refused_in_one_line(source):
 def test_maps_that_a_render_leaves_out_are_named_in_the_first_step(source, maps, loss, lacking):
     stage = Stage(steps=4, losses={"l1": L1(), "late": loss})
     trainer, state = begun(stage, Bare(maps=maps), read(Data(source)))
-    with pytest.raises(BadInput, match=f"primitive bare: its render gives no {lacking}"):
+    with pytest.raises(BadInput, match=f"bare: .*no {lacking}"):
         trainer.step(state)
 
 

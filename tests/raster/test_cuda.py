@@ -147,5 +147,5 @@ def test_wrong_values_are_refused():
     shown, view = make("plain", "surfel")
     scales = shown.scales.clone()
     scales[3, 1] = -1
-    with pytest.raises(BadInput, match="splats.scales: 1 of .* not positive; the first is row 3"):
+    with pytest.raises(BadInput, match="splats.scales: 1 of .*positive.*row 3"):
         CUDA.render(type(shown)(**{**vars(shown), "scales": scales}), view, NEAR)

@@ -334,7 +334,7 @@ def test_bad_values_are_refused_with_their_row(kind, name, value, words):
     row = int(case("plain", kind).true.seen.nonzero()[9, 0])
     tensor = getattr(shown, name).clone()
     tensor[row] = value
-    with pytest.raises(BadInput, match=f"splats.{name}: 1 of 70 rows are {words}.*; the first is row {row}$"):
+    with pytest.raises(BadInput, match=f"splats.{name}: 1 of 70 .*{words}.*row {row}$"):
         NativeRasterizer().render(replace(shown, **{name: tensor}), view, NEAR)
 
 
@@ -342,7 +342,7 @@ def test_values_beyond_float32_are_refused():
     shown, view = make("plain", "surfel")
     exact = double(shown)
     exact.scales[5] = 1e-60
-    with pytest.raises(BadInput, match="row 5 is out of the range of float32"):
+    with pytest.raises(BadInput, match="row 5 .*float32"):
         NativeRasterizer().render(exact, view, NEAR)
 
 

@@ -147,7 +147,7 @@ def test_the_number_of_threads_does_not_change_a_bit():
 
 def test_discs_and_values_that_are_not_finite_are_refused():
     discs, view = make("plain", "surfel")
-    with pytest.raises(BadInput, match="rays meet ellipsoids, which have three scales; surfel splats have two"):
+    with pytest.raises(BadInput, match="ellipsoids.*surfel splats"):
         ray_opacity(discs, view, NEAR, torch.zeros(1, 3, dtype=torch.float64))
     splats, view = make("plain", "gaussian")
     splats.scales[3, 1] = torch.nan

@@ -76,7 +76,7 @@ def test_torch_computes_where_the_rasterizer_draws(monkeypatch, on_cuda, device,
     for there, wanted in ((False, without), (True, with_cuda)):
         monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
         if wanted is None:
-            with pytest.raises(BadInput, match=f"--device {device}: torch finds no CUDA device here; use --device cpu"):
+            with pytest.raises(BadInput, match=f"--device {device}: .*no CUDA device .*--device cpu"):
                 torch_device(device)
         else:
             assert torch_device(device) == torch.device(wanted)
@@ -97,7 +97,7 @@ def test_a_gpu_by_its_number(monkeypatch, on_cuda):
     assert select("cuda:1") == (CudaRasterizer(), "cuda:1 GPU") and torch_device("cuda:1") == torch.device("cuda")
     assert taken == [1, 1]
     for ask in (select, torch_device):
-        with pytest.raises(BadInput, match="--device cuda:2: torch finds 2 of them here; the last is cuda:1"):
+        with pytest.raises(BadInput, match="--device cuda:2: .*2 .*cuda:1"):
             ask("cuda:2")
         with pytest.raises(BadInput, match="'cuda:x'"):
             ask("cuda:x")
@@ -111,7 +111,7 @@ def test_auto_takes_the_gpu_that_is_there_and_no_cpu_in_its_place(monkeypatch):
     assert select("auto") == select("cuda") == (CudaRasterizer(), "cuda:0 GPU")
     monkeypatch.setattr(CudaRasterizer, "missing", lambda self: "the driver is too old; update it, or use --device cpu")
     for device in ("auto", "cuda", "nvidia"):
-        with pytest.raises(BadInput, match=f"--device {device}: the driver is too old; update it"):
+        with pytest.raises(BadInput, match=f"--device {device}: the driver is too old"):
             select(device)
     assert select("cpu")[0].device == "cpu"
 

@@ -38,7 +38,7 @@ def spoilt(kind: str, name: str, row: int, value: float):
 )
 def test_bad_values_are_named_with_their_row(kind, name, value, words):
     shown, view = spoilt(kind, name, 7, value)
-    with pytest.raises(BadInput, match=f"splats.{name}: 1 of 70 rows are {words}.*; the first is row 7"):
+    with pytest.raises(BadInput, match=f"splats.{name}: 1 of 70 .*{words}.*row 7"):
         validate(shown)
     with pytest.raises(BadInput, match=f"splats.{name}"):
         Reference().render(shown, view, NEAR)
@@ -65,7 +65,7 @@ def test_wrong_shapes_are_named(name, shape, wanted):
 def test_scales_fit_the_kind():
     shown, _ = make("plain", "gaussian")
     validate(shown)
-    with pytest.raises(BadInput, match=r"splats\.scales: shape \(70, 2\); a gaussian needs \(70, 3\)"):
+    with pytest.raises(BadInput, match=r"splats\.scales: shape \(70, 2\); .*\(70, 3\)"):
         validate(replace(shown, scales=shown.scales[:, :2]))
 
 
@@ -75,7 +75,7 @@ def test_scales_fit_the_kind():
         (
             "gaussian",
             {"geometry": "disc"},
-            "splats.geometry: 'disc' of kind 'gaussian'; gaussians have axis, plane, ray",
+            "splats.geometry: 'disc' .*'gaussian'; .*axis, plane, ray",
         ),
         ("surfel", {"geometry": "ray"}, "surfels only axis"),
         ("gaussian", {"geometry": "ray", "antialias": True}, "splats.antialias: gaussians of geometry 'ray'"),

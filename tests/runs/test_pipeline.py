@@ -55,7 +55,7 @@ def finished(data, recipe, tmp_path_factory):
 
 
 def test_lengths_in_metres_are_refused_before_training_where_the_unit_is_not_known(data, recipe, tmp_path):
-    with pytest.raises(BadInput, match="mesh.voxel: a length of 1 m cannot be used.*--metres-per-unit"):
+    with pytest.raises(BadInput, match="mesh.voxel: .*1 m .*--metres-per-unit"):
         run(replace(recipe, mesh=TSDF(voxel=1.0)), data, tmp_path / "run")
     assert not (tmp_path / "run" / "run.json").exists()
 
@@ -178,7 +178,7 @@ def test_a_run_from_before_there_was_a_setting_goes_on(finished, data, recipe, t
 
 
 def test_other_data_is_refused(finished, data, recipe):
-    with pytest.raises(BadInput, match="data.test_every 8, and this one has 4"):
+    with pytest.raises(BadInput, match="data.test_every 8, .*4"):
         run(recipe, replace(data, test_every=4), finished[0])
 
 
@@ -201,7 +201,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
         patch.setattr(stage, "TrainingDisplay", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path)
-    assert f"stopped after step {at} of 60; the same command goes on" in capsys.readouterr().err
+    assert f"stopped after step {at} of 60" in capsys.readouterr().err
     assert not (tmp_path / "metrics.json").exists()
     with pytest.raises(BadInput, match=f"stopped after step {at} of 60"):
         load_run(tmp_path)
@@ -295,7 +295,7 @@ def test_photographs_that_are_no_longer_there_are_noticed(data, recipe, tmp_path
     run(with_steps(recipe, 2), data, tmp_path)
     scene = read(data)
     monkeypatch.setattr(pipeline, "read", lambda given: replace(scene, train=scene.train[1:]))
-    with pytest.raises(BadInput, match="trained on 10 photographs and .* now gives 9"):
+    with pytest.raises(BadInput, match="10 photographs .*now gives 9"):
         run(with_steps(recipe, 2), data, tmp_path)
 
 
@@ -318,7 +318,7 @@ def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_pat
     assert (data.path / "resized").exists() == copies
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
     assert metrics["images"] == finished[1]["images"]
-    with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
+    with pytest.raises(BadInput, match="--cache lots: .*4GB"):
         run(recipe, data, tmp_path, caches=CacheSettings("lots"))
 
 

@@ -189,7 +189,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
         with pytest.raises(KeyboardInterrupt):
             run(recipe, farm, tmp_path / "run", intervals=Intervals(checkpoint=2))
     shutil.rmtree(own_cache / "depth")
-    with pytest.raises(BadInput, match="leave out --no-prepare to make them again"):
+    with pytest.raises(BadInput, match="leave out --no-prepare"):
         run(recipe, farm, tmp_path / "run", caches=CacheSettings(maps=None))
     seen = counting(monkeypatch)
     run(recipe, farm, tmp_path / "run")
@@ -205,18 +205,13 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
 
 def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, recipe, tmp_path, own_cache, monkeypatch):
     seen = counting(monkeypatch)
-    with pytest.raises(
-        BadInput, match="prepare depth .*without --no-prepare .*depth:patch-match, or choose start:sparse"
-    ) as refused:
+    with pytest.raises(BadInput, match="depth .*--no-prepare .*depth:patch-match.*start:sparse") as refused:
         run(recipe, farm, tmp_path / "a", caches=CacheSettings(maps=None))
     assert "\n" not in str(refused.value) and not (tmp_path / "a").exists()
     sparse = replace(recipe, start=Recipe().start)
     metrics = run(sparse, farm, tmp_path / "b", caches=CacheSettings(maps=None))
     (note,) = record(tmp_path / "b")["notes"]
-    assert (
-        "has no depth priors, so everything that learns from them is switched off" in note
-        and metrics["prepare_cpu_seconds"] is None
-    )
+    assert "has no depth priors, so everything" in note and metrics["prepare_cpu_seconds"] is None
     assert not seen and not (own_cache / "depth").exists()
 
 
@@ -227,10 +222,8 @@ def test_a_loss_of_normals_that_the_maps_do_not_have_is_warned_of(farm, recipe, 
     for _ in range(2):  # the second time, nothing is left to do
         run(recipe, farm, tmp_path / "run")
         made, without = record(tmp_path / "run")["notes"]
-        assert "made with plane-sweep" in made and without == (
-            "7 of 7 depth priors have no normals, and the loss normal-prior learns nothing from those; "
-            "depth:patch-match makes some that have"
-        )
+        assert "made with plane-sweep" in made and "7 of 7 depth priors have no normals" in without
+        assert "loss normal-prior" in without and "depth:patch-match" in without
 
 
 def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, own_cache):
@@ -281,7 +274,7 @@ def test_maps_of_the_data_set_that_were_made_otherwise_are_told(farm, recipe, tm
         path.write_text(json.dumps(whole | {"longest": side}))
         run(replace(recipe, depth=replace(SWEEP, longest=64, window=7)), farm, tmp_path / f"small{side}")
         (note,) = record(tmp_path / f"small{side}")["notes"]
-        assert f"made with other settings of plane-sweep than the recipe has{more}: the run uses these; move" in note
+        assert f"other settings of plane-sweep than the recipe has{more}: " in note
     for at, other in enumerate(("", ', "estimator": "x"', ', "estimator": 7', ', "estimator": {"a": 1}')):  # foreign
         (farm.path / "estimated_depths" / "depth.json").write_text(f'{{"aligned": true{other}}}')
         run(recipe, farm, tmp_path / f"foreign{at}")
@@ -310,7 +303,7 @@ def test_a_damaged_photograph_gets_no_map(farm, recipe, tmp_path, own_cache):
 def test_photographs_that_are_all_damaged_are_one_line(farm, recipe, tmp_path, own_cache):
     for photo in (farm.path / "images").iterdir():
         photo.write_bytes(photo.read_bytes()[:400])
-    with pytest.raises(BadInput, match="none of the 7 photographs can be read, .*png for one"):
+    with pytest.raises(BadInput, match="7 photographs .*png for one"):
         run(recipe, farm, tmp_path / "run")
     assert not maps(own_cache)
 
@@ -330,14 +323,14 @@ def test_a_data_set_that_cannot_be_written_to_is_no_matter(farm, recipe, tmp_pat
 def test_a_cache_that_cannot_be_written_to_is_one_line(farm, recipe, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "file"))
-    with pytest.raises(BadInput, match="cannot be written .*; set SURFKIT_CACHE to a folder") as error:
+    with pytest.raises(BadInput, match="cannot be written .*SURFKIT_CACHE") as error:
         run(recipe, farm, tmp_path / "run")
     assert "\n" not in str(error.value) and not (tmp_path / "run").exists()
 
 
 def test_worker_elsewhere_finds_the_maps_in_its_own_cache_or_says_so(own_cache, tmp_path):
     there = tmp_path / "other/depth/0123"
-    with pytest.raises(BadInput, match="set SURFKIT_CACHE to a folder that both see"):
+    with pytest.raises(BadInput, match="SURFKIT_CACHE .*both see"):
         located(there)
     (folder_of("0123") / "estimated_depths").mkdir(parents=True)
     assert located(there) == own_cache / "depth/0123"
@@ -380,9 +373,9 @@ def test_making_maps_makes_room(farm, recipe, tmp_path, own_cache):
     assert str(left) == record(tmp_path / "b")["data"]["priors"]
     with pytest.raises(BadInput, match="--prepare-cache lots: give a size"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="lots"))
-    with pytest.raises(BadInput, match="--prepare-cache -1GB: give a size such as 4GB or 500MB$"):
+    with pytest.raises(BadInput, match="--prepare-cache -1GB: .*4GB or 500MB$"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="-1GB"))
-    with pytest.raises(BadInput, match="--prepare-cache auto: give a size such as 20GB"):
+    with pytest.raises(BadInput, match="--prepare-cache auto: .*20GB"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="auto"))
 
 

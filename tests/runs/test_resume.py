@@ -128,7 +128,7 @@ def test_a_run_is_made_longer(finished, recipe, whole_recipe, tmp_path, monkeypa
     assert metrics["steps"] == 40 and load_run(out)[0].recipe == complete(long) and steps(out) == list(range(1, 41))
     assert len(notes(out)) == 1 and notes(out)[0].startswith("the run is made longer, from 24 steps to 40")
     assert run(long, data, out) == metrics and len(notes(out)) == 1
-    with pytest.raises(BadInput, match=r"pretrain.steps 40, and this one has 24"):
+    with pytest.raises(BadInput, match="pretrain.steps 40, .*24"):
         run(recipe, data, out)
 
 
@@ -151,7 +151,7 @@ def test_a_longer_run_of_another_recipe_is_refused(done, whole_recipe, path, val
 
 def test_a_folder_in_use_is_refused(data, recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "LOCK_TIMEOUT_S", 0.0)
-    with locked(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on \S+ works in it"):
+    with locked(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on"):
         run(recipe, data, tmp_path / "run")
 
 
@@ -176,7 +176,7 @@ def test_data_that_changed_are_named(data, recipe, tmp_path, monkeypatch):
     photo = images / "view_003.png"
     before = photo.read_bytes()
     touched(photo, flip)
-    with pytest.raises(BadInput, match=r"began with: photograph view_003.png has changed; put them back"):
+    with pytest.raises(BadInput, match="photograph view_003.png has"):
         run(recipe, data, out)
     photo.write_bytes(before)
     model = data.path / "sparse" / "0"
@@ -218,7 +218,7 @@ def test_masks_and_depth_maps_that_changed_are_named(data, recipe, tmp_path, mon
             run(recipe, data, out)
         path.write_bytes(before)
     write_record(data.path, {"aligned": False})
-    with pytest.raises(BadInput, match="the depth map of view_001.png has changed, come or gone and 9 more"):
+    with pytest.raises(BadInput, match="depth map of view_001.png .* 9 more"):
         run(recipe, data, out)
     write_record(data.path, {"aligned": True})
     run(recipe, data, out)
@@ -313,9 +313,7 @@ def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data,
 def test_a_third_time_is_the_last(data, recipe, tmp_path, monkeypatch, at):
     bad, out = spoilt(recipe, at, 0.0, monkeypatch), tmp_path / "run"
     for _ in range(2):  # the same command again knows that the rates were halved
-        with pytest.raises(
-            Fault, match=rf"step {at}, view view_0\d\d.png: the scales are not finite, also after .* 2 t"
-        ):
+        with pytest.raises(Fault, match=rf"step {at}, view view_0\d\d.png: .*scales .* 2 t"):
             run(bad, data, out, intervals=Intervals(10))
     state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
     assert state.halvings == 2 and state.index == (10 if at == 13 else 0) and len(notes(out)) == 2
@@ -329,7 +327,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size // 2, limits[1]))
     try:
-        with pytest.raises(Fault, match=r"the disk is full .* last checkpoint in .*run is whole: free some space"):
+        with pytest.raises(Fault, match="the disk is full .*last checkpoint"):
             run(recipe, data, out, intervals=Intervals(5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -342,7 +340,7 @@ def test_a_disk_that_fills_before_the_first_checkpoint_claims_none(data, recipe,
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
     try:
-        with pytest.raises(Fault, match=r"checkpoint.safetensors: the disk is full \(.*\): free some space") as found:
+        with pytest.raises(Fault, match="checkpoint.safetensors: the disk is full") as found:
             run(recipe, data, out, intervals=Intervals(5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -360,7 +358,7 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", short)
-        with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
+        with pytest.raises(Fault, match="out of memory.*no longer kept.*--longest"):
             run(recipe, data, tmp_path / "run", intervals=Intervals(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
     run(recipe, data, tmp_path / "run")
@@ -384,7 +382,7 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
     run(recipe, data, out, intervals=Intervals(10))
     times = {3: 1, 1: 2}[photographs]
     assert len(notes(out)) == times and kept[-1] <= photographs * 40 * 30 * 3 < kept[11]
-    assert all(text.startswith("step 13: out of memory; photographs, masks and depth priors in") for text in notes(out))
+    assert all(text.startswith("step 13: out of memory; photographs") for text in notes(out))
     assert (out / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
     assert steps(out) == list(range(1, STEPS + 1))
 
@@ -394,7 +392,7 @@ def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkey
     monkeypatch.setattr("surfkit.runs.run_stage.free_bytes", lambda: next(free))
     assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
     assert len(notes(tmp_path / "run")) == 1
-    assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")
+    assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free")
 
 
 @pytest.mark.parametrize("name", ["point_cloud.ply", "metrics.json", "view_000.png.png", "run.json"])
@@ -411,7 +409,7 @@ def test_a_disk_that_is_full_at_the_end(done, recipe, monkeypatch, name):
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
-        with pytest.raises(Fault, match=rf"{name}: the disk is full .* last checkpoint in .*run is whole: free some"):
+        with pytest.raises(Fault, match=rf"{name}: the disk is full .*last checkpoint"):
             run(recipe, data, out)
     assert not list(out.rglob(".*")) and not (out / "metrics.json").exists()
     assert checkpoint.load(out / "pretrain" / "checkpoint.safetensors").index == STEPS

@@ -92,7 +92,7 @@ def test_a_unit_that_contradicts_the_system_is_refused(crs, metres, agrees):
     if agrees:
         refuse_other_unit(crs, metres, place)
         return
-    with pytest.raises(BadInput, match=r"says that a unit is .* m; correct metres_per_unit"):
+    with pytest.raises(BadInput, match=r"a unit is .* m; .*metres_per_unit"):
         refuse_other_unit(crs, metres, place)
 
 

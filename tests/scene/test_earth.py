@@ -66,8 +66,8 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
         ("EPSG:2263+5703", "in units of US survey foot, heights in metre"),
         ("EPSG:3857", "1 m to the east or north is .* m on the map"),
         ("EPSG:5513", "its axes point south and west"),
-        ("+proj=utm +zone=33 +ellps=bessel", "the shift from its datum to WGS 84 is not known"),
-        ("EPSG:4326", "it is in degrees, where lengths belong"),
+        ("+proj=utm +zone=33 +ellps=bessel", "shift .*WGS 84 is not known"),
+        ("EPSG:4326", "degrees, where lengths"),
         ("EPSG:1", "pyproj cannot place it on Earth"),
     ],
 )
@@ -142,6 +142,6 @@ def test_a_datum_that_is_placed_roughly_only_is_told():
     """Without its grid, PROJ brings DHDN to WGS 84 within 2 m there; far from Germany by any shift that it knows."""
     notes = on_earth("EPSG:31468", BERLIN[0], geoid_of("40"))[1]
     if notes:  # else the grid is installed here
-        assert "EPSG:31468 is placed on Earth within 2 m; for 1 m PROJ needs the grid de_adv_BETA2007.tif" in notes[0]
+        assert "EPSG:31468 is placed on Earth within 2 m" in notes[0] and "de_adv_BETA2007.tif" in notes[0]
     (note,) = on_earth("EPSG:25832", np.array([5e5, 2e6, 0.0]), geoid_of("40"))[1]
     assert "EPSG:25832 is not meant for latitude 18." in note

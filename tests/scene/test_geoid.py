@@ -51,8 +51,8 @@ def test_a_grid_in_metres_of_a_map(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("1000", "the geoid lies 107 m below the ellipsoid to 86 m above"),
-        ("nan", "the geoid lies 107 m below the ellipsoid to 86 m above"),
+        ("1000", "107 m below .*86 m above"),
+        ("nan", "107 m below .*86 m above"),
         ("no.gtx", "no such file, and no number"),
         ("text.gtx", "no raster that GDAL reads"),
         ("far.gtx", "it does not reach the scene"),

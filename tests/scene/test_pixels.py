@@ -231,7 +231,7 @@ def test_what_the_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
     path = bomb(tmp_path / "a.png", 20_000, 10_000)
     monkeypatch.setattr(large, "free_bytes", lambda: 10**9)
     for read in (lambda: read_photo(path, (40, 30)), lambda: refuse_large(path, (20_000, 10_000), (40, 30))):
-        with pytest.raises(BadInput, match="a.png: 20,000 x 10,000 px .*GB of memory.*SURFKIT_MAX_MEGAPIXELS=200"):
+        with pytest.raises(BadInput, match="a.png: 20,000 x 10,000 px .*SURFKIT_MAX_MEGAPIXELS=200"):
             read()
     assert photos.photo_size(path) == (20_000, 10_000), "its header can be read"
     assert Image.MAX_IMAGE_PIXELS is not None, "for other programs in this process"
@@ -269,9 +269,9 @@ def test_the_user_sets_the_limit(tmp_path, monkeypatch):
     monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, "0.4")
     read_photo(tmp_path / "a.png", (64, 48))
     monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, "0.3")
-    with pytest.raises(BadInput, match="more than the limit SURFKIT_MAX_MEGAPIXELS=0.3"):
+    with pytest.raises(BadInput, match="SURFKIT_MAX_MEGAPIXELS=0.3"):
         read_photo(tmp_path / "a.png", (64, 48))
     for wrong in ("much", "-1", "nan", "inf"):
         monkeypatch.setenv(large.MEGAPIXELS_VARIABLE, wrong)
-        with pytest.raises(BadInput, match=f"SURFKIT_MAX_MEGAPIXELS={wrong}: give"):
+        with pytest.raises(BadInput, match=f"SURFKIT_MAX_MEGAPIXELS={wrong}: "):
             read_photo(tmp_path / "a.png", (64, 48))

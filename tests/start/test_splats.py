@@ -111,7 +111,7 @@ def test_it_resumes_without_the_file_and_refuses_another(data, trained, tmp_path
         run(recipe, data, tmp_path / "cut", intervals=often)
     table = read_splats(path)
     write_splats(path, replace(table, opacity_logits=table.opacity_logits + 0.1))
-    with pytest.raises(BadInput, match="a.ply has changed since the run began"):
+    with pytest.raises(BadInput, match="a.ply has changed"):
         run(recipe, data, tmp_path / "cut", intervals=often)
     path.unlink()
     again = run(recipe, data, tmp_path / "cut", intervals=often)
@@ -128,10 +128,10 @@ def test_blocks_go_on_too(data, trained, tmp_path):
 
 def test_discs_become_ellipsoids_and_back_with_a_note(data, trained, tmp_path):
     metrics = run(going_on(trained[0], "3dgs", steps=2), data, tmp_path / "balls")
-    assert "its surfels become gaussians, as the recipe has primitive:gaussian3d" in notes(tmp_path / "balls")
+    assert "surfels become gaussians" in notes(tmp_path / "balls")
     assert abs(metrics["images"]["psnr"] - trained[1]["images"]["psnr"]) < 2
     back = run(going_on(tmp_path / "balls", "2dgs", steps=2), data, tmp_path / "discs")
-    assert "its gaussians become surfels without their thinnest axis" in notes(tmp_path / "discs")
+    assert "gaussians become surfels" in notes(tmp_path / "discs")
     assert abs(back["images"]["psnr"] - trained[1]["images"]["psnr"]) < 2
 
 
@@ -149,8 +149,8 @@ def test_ellipsoids_that_are_pressed_flat_are_told_unless_they_are_flat(data, tm
 def test_harmonics_that_are_cut_and_another_antialias_are_told(data, tmp_path):
     path = like_3dgs(tmp_path / "a.ply", read(data))
     run(going_on(path, "3dgs", steps=1, primitive=Gaussian3D(sh_degree=1, antialias=True)), data, tmp_path / "out")
-    assert "degree 3, which are cut to 1; --primitive.sh-degree 3 keeps them" in notes(tmp_path / "out")
-    assert "trained without antialias; add --primitive.no-antialias" in notes(tmp_path / "out")
+    assert "cut to 1; --primitive.sh-degree 3" in notes(tmp_path / "out")
+    assert "add --primitive.no-antialias" in notes(tmp_path / "out")
     assert load_run(tmp_path / "out")[1].sh_degree == 1
 
 
@@ -166,15 +166,15 @@ def test_the_contract_of_a_start(tmp_path):
 
 
 def test_what_it_cannot_begin_at(data, trained, tmp_path):
-    with pytest.raises(BadInput, match="start.file is not set; name a file of splats with --start.file FILE"):
+    with pytest.raises(BadInput, match="start.file .*--start.file FILE"):
         run(going_on(None), data, tmp_path / "out")
-    with pytest.raises(BadInput, match=r"start.file .*none.ply: no such file"):
+    with pytest.raises(BadInput, match="start.file .*none.ply: no such"):
         run(going_on(tmp_path / "none.ply"), data, tmp_path / "out")
     path = like_3dgs(tmp_path / "a.ply", read(data))
     table = read_splats(path)
     table.quats[3] = 0
     write_splats(path, table)
-    with pytest.raises(BadInput, match=r"1 of 250 splats have a rotation of length 0, splat 3 is the first"):
+    with pytest.raises(BadInput, match="1 of 250 .*rotation .*splat 3 "):
         run(going_on(path), data, tmp_path / "out")
     assert not (tmp_path / "out" / "recipe.json").exists()
 

@@ -199,7 +199,7 @@ def test_fewer_points_than_asked_for_are_told(farm, monkeypatch):
         return count, [event.text for event in said if isinstance(event, Warned)]
 
     count, (note,) = told(StereoStart(points=10_000_000))
-    assert note == f"start.points is 10,000,000, and the depth maps give {count:,}, a pixel apart"
+    assert note.startswith("start.points is 10,000,000") and f" {count:,}," in note
     assert not told(StereoStart(points=1_000))[1] and not told(StereoStart())[1]
 
 

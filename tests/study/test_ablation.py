@@ -135,9 +135,9 @@ def test_rows_build_on_the_last_kept_one():
     assert [recipe.primitive.sh_degree for recipe in recipes.values()] == [3, 3, 0]
     on = replace(FALLBACKS, rows=(*FALLBACKS.rows, Row("aside", {"seed": 9}, on="given up")))
     assert build(on)["aside"].pretrain.sh_every == 7 and built_on(on)["aside"] == "given up"
-    with pytest.raises(BadInput, match="row 'early': no row above named 'late'; known: $|known: none"):
+    with pytest.raises(BadInput, match="row 'early': .*'late'; known: none"):
         replace(FALLBACKS, rows=(Row("early", on="late"), Row("late")))
-    with pytest.raises(BadInput, match="row 'x', paper: no column named 'PSNR'; did you mean 'ssim'|no column named"):
+    with pytest.raises(BadInput, match="row 'x', paper: .*'PSNR'"):
         Row("x", paper={"PSNR": 20.0})
     assert built_on(FALLBACKS) == {"start": None, "given up": "start", "end": "start"}
 
@@ -202,7 +202,7 @@ def test_the_baseline_is_the_published_one():
 
 def test_a_row_that_cannot_be_built_says_which():
     table = Table("bad", "", COARSE_BASELINE, (Row("base"), Row("worse", {"pretrain.densfy": None})))
-    with pytest.raises(BadInput, match="table:bad, row 'worse': pretrain has no 'densfy'"):
+    with pytest.raises(BadInput, match="table:bad, row 'worse': .*'densfy'"):
         build(table)
     with pytest.raises(BadInput, match="two rows 'a'"):
         Table("bad", "", COARSE_BASELINE, (Row("a"), Row("b"), Row("a")))
@@ -221,7 +221,7 @@ def test_rows_are_picked_by_number_or_label():
     assert pick(FALLBACKS, []) == ["start", "given up", "end"]
     assert pick(FALLBACKS, ["3", "start"]) == ["start", "end"]
     for wrong in ("0", "4", "strt"):
-        with pytest.raises(BadInput, match=f"no row named '{wrong}'.*known: start, given up, end; .* 1 to 3"):
+        with pytest.raises(BadInput, match=f"no row .*'{wrong}'.*known: start, given up, end; .* 1 to 3"):
             pick(FALLBACKS, [wrong])
 
 

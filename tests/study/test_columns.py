@@ -45,7 +45,7 @@ def test_columns_are_those_that_were_measured_but_lpips_only_if_it_is_named():
 
 def test_names_of_columns_are_checked():
     refuse_unknown_columns(list(TABLE_COLUMNS))
-    with pytest.raises(BadInput, match="--columns: no column named 'time'; known: ssim, psnr, .*, fps"):
+    with pytest.raises(BadInput, match="--columns: .*'time'; known: ssim, psnr, .*, fps"):
         refuse_unknown_columns(["psnr", "time"])
     with pytest.raises(BadInput, match="psnr is there twice"):
         refuse_unknown_columns(["psnr", "ssim", "psnr"])

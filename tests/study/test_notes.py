@@ -66,10 +66,10 @@ def test_rows_that_lack_depth_maps_are_named_before_they_run(data, tmp_path):
         return lines_on_depth(found, LABELS)
 
     (line,) = lines()
-    assert line.startswith(f"{data.path} has no depth priors, so everything that learns from them is switched off, ")
+    assert line.startswith(f"{data.path} has no depth priors, so everything")
     assert line.endswith(f", in rows 2 and 4; make them with `surfkit prepare depth {data.path}`")
     (line,) = lines(e=replace(PLAIN, start=StereoStart()), f=Recipe(method=StereoFusion()))
-    assert "in rows 2 and 4 to 6; rows 5 and 6 will fail, as training begins at depth maps; make them" in line
+    assert "rows 2 and 4 to 6; rows 5 and 6 will fail" in line
     (line,) = lines(g=with_loss(normal=NormalPrior()))
     assert line.endswith(f"in rows 2, 4 and 7; make them with `surfkit prepare depth {data.path}`")
     assert lines(b=PLAIN, d=PLAIN) == []

@@ -190,7 +190,7 @@ def test_a_recipe_that_could_not_be_read_again_is_refused_before_it_runs(part, t
     try:
         plain = recipes()["2dgs"]
         recipe = replace(plain, pretrain=replace(plain.pretrain, prune=(part(),)))
-        with pytest.raises(BadInput, match="the recipe cannot be saved: .*the author of the part"):
+        with pytest.raises(BadInput, match="recipe cannot be saved: .*author"):
             run(recipe, Data(tmp_path), tmp_path / "out")
     finally:
         plugins().unregister(offers)
@@ -220,7 +220,7 @@ def test_weights_that_make_no_sense_are_refused(loss, said):
 def test_a_stage_without_any_loss_is_refused(losses, path):
     recipe = recipes()["citygs2"]
     stage = replace(getattr(recipe, path), losses=losses, signal=LossGradient(terms=None))
-    with pytest.raises(BadInput, match=rf"^{path}\.losses: .*nothing would be learnt.*{path}\.losses\.l1:l1"):
+    with pytest.raises(BadInput, match=rf"^{path}\.losses: .*{path}\.losses\.l1:l1"):
         replace(recipe, **{path: stage}).refuse_unfit()
 
 

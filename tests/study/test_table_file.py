@@ -61,14 +61,14 @@ def changing(**change):
     ("table", "message"),
     [
         ("{", "not JSON: .* line 1"),
-        (TABLE | {"rows": []}, "rows: there are none; give at least one"),
+        (TABLE | {"rows": []}, "rows: .*none"),
         (TABLE | {"rows": [{"labl": "x"}]}, "rows.0.labl: unknown setting; RowJson has label, change, recipe, kept, "),
-        (TABLE | {"base": "2dsg"}, "base: no recipe named '2dsg'; did you mean '2dgs'?.* or give the recipe itself"),
+        (TABLE | {"base": "2dsg"}, "base: .*'2dsg'; .*'2dgs'?.*the recipe itself"),
         (TABLE | {"base": {"sed": 1}}, "base.sed: unknown setting"),
         (TABLE | {"rows": [{"label": "x", "recipe": 3}]}, "rows.0.recipe: expected an object"),
         (changing(**{"pretrain.densfy": None}), "rows.0.change.pretrain.densfy: pretrain.densfy: unknown setting"),
         (changing(**{"pretrian.steps": 3}), "rows.0.change.pretrian.steps: the recipe has no 'pretrian'; it has about"),
-        (changing(**{"pretrain.steps.x": 3}), "pretrain.steps is 30000, which has no 'x' inside; set pretrain.steps "),
+        (changing(**{"pretrain.steps.x": 3}), "pretrain.steps is 30000, .*'x' "),
         (changing(**{"pretrain.densify.filters.0": 3}), "has no position '0'; it has 0 elements"),
         (changing(**{"pretrain.signal": {"terms": []}}), "a Signal without its name; add \"use\": one of "),
         (changing(**{"pretrain.signal": {"use": "no"}}), "pretrain.signal: no Signal named 'no'; known: "),
@@ -99,9 +99,9 @@ def test_tables_in_python(tmp_path):
     assert [recipe.pretrain.steps for recipe in build(read_table(str(path))).values()] == [30_000, 5]
     path = written(tmp_path, PYTHON + "TABLES = (ONE, TWO)\n", "b.py")
     assert read_table(f"{path}:two").about == "Second"
-    with pytest.raises(BadInput, match="it has the tables one, two; name one, such as .*b.py:one"):
+    with pytest.raises(BadInput, match="tables one, two; .*b.py:one"):
         read_table(str(path))
-    with pytest.raises(BadInput, match="b.py: no table named 'three'; known: one, two"):
+    with pytest.raises(BadInput, match="b.py: .*'three'; known: one, two"):
         read_table(f"{path}:three")
     path = written(tmp_path, PYTHON + "TABLES = {'x': TWO}\n", "c.py")
     assert read_table(str(path)).name == "two"
@@ -112,8 +112,8 @@ def test_tables_in_python(tmp_path):
     [
         ("x = 1\ny = z\n", "bad.py, line 2: NameError: name 'z' is not defined"),
         ("x = (\n", "bad.py, line 1: SyntaxError: "),
-        ("x = 1\n", "bad.py: it defines neither TABLE nor TABLES; assign a surfkit.Table"),
-        ("TABLE = 3\n", "bad.py: TABLE or TABLES holds 3, which is no surfkit.Table"),
+        ("x = 1\n", "bad.py: .*neither TABLE nor TABLES; .*surfkit.Table"),
+        ("TABLE = 3\n", "bad.py: TABLE or TABLES holds 3"),
         ("TABLES = []\n", "bad.py: TABLES is empty"),
         (PYTHON + "TABLE = Table('t', '', TWO.base, (Row('r', {'sed': 1}),))\n", "table:t, row 'r': Recipe has"),
         (PYTHON + "TABLE = Table('t', '', TWO.base, (Row('r'), Row('r')))\n", "bad.py, line 7: table:t has two rows"),

@@ -147,14 +147,14 @@ class Random(Wrong):
         (Everything(), "Everything recognises an empty folder"),
         (Nothing(), "Nothing does not recognise"),
         (Writes(), "Writes changes files of the data set"),
-        (OpenGL(), "OpenGL: no sparse point lies in front of view_000.png; poses are world_to_camera, z forward"),
+        (OpenGL(), "OpenGL: no sparse point .*view_000.png; .*world_to_camera"),
         (CameraToWorld(), "CameraToWorld: (cameras are turned otherwise|no sparse point lies in front)"),
-        (Mirrored(), "Mirrored: view_000.png: the pose is not a rotation and a translation"),
+        (Mirrored(), "Mirrored: view_000.png: the pose"),
         (Scaled(), "Scaled: view_000.png: the pose is not a rotation"),
         (Single(), r"Single: xyz is not \(P, 3\) finite float64"),
         (Twice(), "Twice: two photographs have the same name"),
-        (Elsewhere(), "Elsewhere: held_out names .*nobody.png.*, which is no photograph"),
-        (Random(), "Random.read is not repeatable: xyz differs; it may depend on the data set only"),
+        (Elsewhere(), "Elsewhere: held_out .*nobody.png"),
+        (Random(), "Random.read is not repeatable: xyz"),
     ],
 )
 def test_readers_that_are_wrong(reader, message, colmap, truth):
@@ -183,8 +183,8 @@ class Farther(Wrong):
 @pytest.mark.parametrize(
     ("reader", "message"),
     [
-        (Turned(), "Turned: cameras are turned otherwise than the true ones"),
-        (Farther(), "Farther: cameras stand elsewhere than the true ones"),
+        (Turned(), "Turned: cameras are turned"),
+        (Farther(), "Farther: cameras stand"),
     ],
 )
 def test_what_only_the_truth_tells(reader, message, colmap, truth):

@@ -96,15 +96,15 @@ class Lax(Steps):
     ("encoding", "message"),
     [
         (Twice(), "Twice.columns must be names"),
-        (Writes(), r"Writes.encode changed its input values\['scales'\]; work on a copy"),
-        (Draws(), r"Draws.encode is not repeatable: \['scales'\] differs; draw nothing in it"),
-        (Signed(), r"Signed.encode: stream scales must be \(rows, components\) of an unsigned type"),
-        (Double(), "Double.decode: 'scales' came back as torch.float64, not torch.float32"),
+        (Writes(), r"Writes.encode changed .*values\['scales'\]"),
+        (Draws(), r"Draws.encode is not repeatable: \['scales'\]"),
+        (Signed(), r"Signed.encode: stream scales .*unsigned"),
+        (Double(), "Double.decode: 'scales' .*float64, .*float32"),
         (Silent(), "Silent.decode: the column 'scales' does not come back"),
-        (Drifts(), "Drifts: what comes back gives other numbers in stream scales"),
-        (Coarse(), "Coarse: 'scales' came back .* of its spread away from what it was"),
-        (Trusting(), "Trusting.decode without the stream scales raises KeyError in place of BadInput"),
-        (Lax(), "Lax.decode takes a stream scales with a row too many"),
+        (Drifts(), "Drifts: .*stream scales"),
+        (Coarse(), "Coarse: 'scales' came back .*away"),
+        (Trusting(), "Trusting.decode .*scales .*KeyError .*BadInput"),
+        (Lax(), "Lax.decode .*scales .*row too many"),
     ],
 )
 def test_encodings_that_are_wrong(encoding, message):
@@ -128,7 +128,7 @@ def test_streams_of_any_numbers_must_not_crash():
         def decode(self, streams, kinds, leaf, count, tables):
             return {"opacities": kinds["opacities"].rows(np.zeros(3)[stream(streams, "opacities", count, 1)])}
 
-    with pytest.raises(AssertionError, match="Table.decode with other numbers .* raises IndexError in place of BadIn"):
+    with pytest.raises(AssertionError, match="Table.decode .*IndexError .*BadIn"):
         check_encoding(Table(), near=99)
 
 
@@ -248,11 +248,11 @@ def installed():
     ("compressor", "message"),
     [
         (Says(), "Says.needs_importance must be True or False"),
-        (Changes(), "Changes, 1 points of degree 0: plan changed its input importance; work on a copy"),
-        (Random(), r"plan is not repeatable: \[0\]\['x'\] differs; draw from its seed only"),
+        (Changes(), "Changes, 1 .*degree 0: plan changed .*importance"),
+        (Random(), r"plan is not repeatable: \[0\]\['x'\]"),
         (Encodings(), "plan returned tuple, not a Plan"),
-        (Forgets(), "the column 'means' is taken 0 times; one encoding must take it"),
-        (More(), "it takes the column 'wings', which the model does not have"),
+        (Forgets(), "'means' is taken 0 times"),
+        (More(), "takes the column 'wings'"),
         (Whole(), "table x must be an array of float16, float32"),
         (Short(), "mark x has 5 rows for 0 points"),
         (Shrinks(), "what comes back of a file gives another file"),

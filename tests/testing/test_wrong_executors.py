@@ -75,11 +75,11 @@ class Abandons(Plain):
     [
         (Cheers(), "Cheers: job 1 ended with status 3; it tells 0"),
         (GivesUp(), "GivesUp does not tell of job 2"),
-        (Repeats(), "Repeats tells of job 0 twice, or of one that is not there"),
-        (Promises(), "Promises says that job 0 has ended, which was not begun"),
-        (Collects(), "Collects.run gives no generator, so it cannot be left early"),
-        (Abandons(), "Abandons leaves a job running when it is left early; stop it in a `finally`"),
-        (Plain(places=0), "Plain.at_once is 0; it must be None or a whole number of 1 or more"),
+        (Repeats(), "Repeats tells of job 0 twice"),
+        (Promises(), "Promises .*job 0 .*not begun"),
+        (Collects(), "Collects.run gives no generator"),
+        (Abandons(), "Abandons leaves a job running"),
+        (Plain(places=0), "Plain.at_once is 0; .*None .*1 or more"),
     ],
 )
 def test_executors_that_are_wrong(executor, message, tmp_path, monkeypatch):

@@ -127,18 +127,18 @@ class Coarse(Saved):
     ("form", "message"),
     [
         (Beside(), r"Beside, 0 splats \(gaussian\): wrote \['model.pt', 'more.txt'\] in place of model.pt"),
-        (Moves(), r"Moves, 1 splats \(gaussian\): write changed its input table.means; work on a copy"),
+        (Moves(), r"Moves, 1 splats \(gaussian\): write changed .*table.means"),
         (Draws(), "Draws, 1 splats .gaussian.: the same splats give other bytes"),
         (Forgets(), "Forgets, 1 splats .gaussian.: 0 splats came back"),
         (Flat(), "Flat, 1 splats .gaussian.: they came back as surfel"),
-        (Far(), "Far, .*: a position is .* away from where it was"),
-        (Turned(), "Turned, .*: rotations came back .* away from what they were"),
-        (Grey(), "Grey, .*: sh0 came back .* away from what they were"),
+        (Far(), "Far, .*: a position is .*away"),
+        (Turned(), "Turned, .*: rotations came back"),
+        (Grey(), "Grey, .*: sh0 came back"),
         (Strange(), "Strange, 0 splats .gaussian.: its own file is not known"),
         (Everything(), "Everything.knows a text file"),
-        (Talks(), "Talks, .*: rounding must be one line of text, not 'one.*two'"),
-        (NoNumbers(), r"NoNumbers.write takes NaN; call table.refuse_unsound\(path\)"),
-        (Coarse(), r"Coarse loses survey coordinates; write table.file_means\(frame\)"),
+        (Talks(), "Talks, .*: rounding .*one line.*'one.*two'"),
+        (NoNumbers(), r"NoNumbers.write takes NaN; .*table.refuse_unsound"),
+        (Coarse(), r"Coarse loses .*table.file_means"),
     ],
 )
 def test_formats_that_are_wrong(form, message):
@@ -148,5 +148,5 @@ def test_formats_that_are_wrong(form, message):
 
 
 def test_a_format_that_trusts_its_files():
-    with pytest.raises(AssertionError, match="Trusts.read, for a file that is cut off, raises .* in place of BadInput"):
+    with pytest.raises(AssertionError, match="Trusts.read, .*cut off, .*BadInput"):
         check_format(Trusts())

@@ -81,7 +81,7 @@ WRONG = {
     Lists: "gives a list, not a LodTree",
     Loses: "not each of the",
     Grows: "more points than the one before: 400, 800",
-    Uncovered: "do not hold each point of the first level once",
+    Uncovered: "each point of the first",
     Rises: "error above 0",
     Boxes: "outside that of its parent",
     Infinite: "a box or an error is not finite",

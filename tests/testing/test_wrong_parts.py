@@ -73,11 +73,11 @@ def test_components_that_do_not_conform():
     name = plugins().register(Offer())
     try:
         check(Sound())
-        with pytest.raises(AssertionError, match="Odd adds points after step 1; make it a Densify"):
+        with pytest.raises(AssertionError, match="Odd adds points .*Densify"):
             check(Odd())
-        with pytest.raises(TypeError, match="surfkit.testing has no check of a Kind"):
+        with pytest.raises(TypeError, match="no check of a Kind"):
             check(Own())
-        with pytest.raises(AssertionError, match="Mute.share needs a docstring under it"):
+        with pytest.raises(AssertionError, match="Mute.share .*docstring"):
             check_component(Mute())
         with pytest.raises(AssertionError, match="Nameless needs a docstring"):
             check_component(Nameless())

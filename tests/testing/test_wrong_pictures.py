@@ -56,7 +56,7 @@ class Constant(Bright):
     [
         (PerPixel(), r"PerPixel gives shape \(3, 24, 32\), not one number"),
         (Divides(), "Divides of an empty render is inf"),
-        (Infinite(), "Infinite of an empty render: the gradient of 'color' is not finite"),
+        (Infinite(), "Infinite of an empty render: .*'color' is not finite"),
         (Negative(), "Negative: the weight at step 500 of 1000 is -100.0"),
         (Constant(), "Constant does not depend on color"),
     ],
@@ -74,7 +74,7 @@ class Covers(Bright):
 
 
 def test_a_loss_may_not_change_the_photograph():
-    with pytest.raises(AssertionError, match="Covers changed its input target.photo; work on a copy"):
+    with pytest.raises(AssertionError, match="Covers changed .*target.photo"):
         check_loss(Covers())
 
 
@@ -140,9 +140,9 @@ class Writes(Faint):
 @pytest.mark.parametrize(
     ("regularizer", "message"),
     [
-        (Remembers(), "Remembers of surfels in a step: a resumed run differs; .* keep in `stat`"),
+        (Remembers(), "Remembers of surfels in a step: .*resumed .*`stat`"),
         (Blind(), "Blind of surfels of a view that shows none is nan"),
-        (Writes(), "Writes of surfels in a step.in_step changed its input maps.color"),
+        (Writes(), "Writes of surfels in a step.in_step .*maps.color"),
     ],
 )
 def test_terms_that_are_wrong_in_a_step(regularizer, message):
@@ -155,8 +155,8 @@ def test_terms_that_are_wrong_in_a_step(regularizer, message):
     [
         (Each(), r"Each gives shape \(60,\), not one number"),
         (Logarithm(), "Logarithm of surfels is nan"),
-        (Cuts(), "Cuts of surfels does not depend on means, quats, scales, opacities, sh"),
-        (Thick(), "Thick of surfels: the gradient of 'scales' is not finite"),
+        (Cuts(), "Cuts .*means, quats, scales, opacities, sh"),
+        (Thick(), "Thick of surfels: .*'scales' is not finite"),
         (Seen(), "Seen of no surfel is nan; a view may show none"),
         (Grows(), "Grows: the weight at step 1 of 1000 is -0.002"),
     ],
@@ -196,10 +196,10 @@ class Loses(Exposure):
 @pytest.mark.parametrize(
     ("appearance", "message"),
     [
-        (Darkens(), "Darkens: the numbers that photograph 0 begins with change its colours"),
+        (Darkens(), "Darkens: .*photograph 0 .*colours"),
         (Unlearned(), "Unlearned gives no gradient by the numbers"),
-        (Reverses(), "Reverses: the learning rate -0.00.* is not a number of 0 or more"),
-        (Spills(), r"Spills.folded changed its input params\['sh0'\]; work on a copy"),
+        (Reverses(), "Reverses: .* -0.00.*0 or more"),
+        (Spills(), r"Spills.folded changed .*params\['sh0'\]"),
         (Loses(), "Loses.folded gives columns of shapes {'sh0'"),
     ],
 )
@@ -268,12 +268,12 @@ class Forgets(Knows):
     ("estimator", "message"),
     [
         (Skips(), r"Skips gives the photographs \[4\]; \[7, 4\] were wanted"),
-        (Depth(), "Depth is `aligned`, but its inverse depths are 1.68 times those of the scene"),
+        (Depth(), "Depth is `aligned`, .*1.68 times"),
         (Outwards(), "Outwards: a normal points away from the camera"),
-        (Percent(), r"Percent: confidence must lie in \[0, 1\]"),
-        (Bare(), "Bare: normals are given if and only if it is `oriented`"),
-        (Knows(scale=20.0), "Knows is `aligned`, but its inverse depths are 20 times those of the scene"),
-        (Forgets(), "Forgets.estimate of a photograph after an interruption is not repeatable: inverse differs"),
+        (Percent(), r"Percent: confidence .*\[0, 1\]"),
+        (Bare(), "Bare: normals .*`oriented`"),
+        (Knows(scale=20.0), "Knows is `aligned`, .* 20 times"),
+        (Forgets(), "Forgets.estimate .*interruption is not repeatable: inverse"),
     ],
 )
 def test_estimators_that_are_wrong(estimator, message):

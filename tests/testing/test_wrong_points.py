@@ -120,8 +120,8 @@ class Forgets(Surfel2D):
         (Grows(), "Grows.split: a child is larger than its parent"),
         (OneChild(), "OneChild.split: 'means' is not 2 M rows"),
         (Unseeded(), "Unseeded.init: 'quats' differs for the same seed"),
-        (Swells(), "Swells.from_table does not give back the scales of its table"),
-        (Forgets(), r"Forgets.from_table gives \['means'\], and columns\(\) declares"),
+        (Swells(), "Swells.from_table .*scales"),
+        (Forgets(), r"Forgets.from_table .*\['means'\], .*columns\(\)"),
         (Thick(), r"Thick.activate: scales: expected shape \(N, 2\)"),
     ],
 )
@@ -153,9 +153,9 @@ class Marks(Sound):
 def test_policies_taken_through_a_stage():
     check_policy(Sound())
     for policy, message in (
-        (Remembers(), "Remembers: drop is not repeatable; .* keep what must last in `points.stat"),
+        (Remembers(), "Remembers: drop is not repeatable; .*`points.stat"),
         (Moves(), "Moves: move is not finite"),
-        (Marks(), "Marks changed its input step.grad_norm; work on a copy"),
+        (Marks(), "Marks changed .*step.grad_norm"),
     ):
         with pytest.raises(AssertionError, match=message):
             check_policy(policy)
@@ -183,11 +183,11 @@ class Unlimited(Doubles):
 @pytest.mark.parametrize(
     ("densify", "message"),
     [
-        (Doubles(at=600), r"Doubles adds points after step 600, which edits\(30000\) does not name"),
-        (Doubles(told=(500, 500)), "Doubles.edits: steps must be in order, each of them once"),
-        (Doubles(told=(0, 500)), "Doubles.edits: steps must lie in 1 to 30000"),
-        (Unlimited(), r"Unlimited.limited\(205\) adds points beyond 205 after step 500"),
-        (Doubles(at=0), "Doubles neither clones nor splits a point at any of the steps that were tried"),
+        (Doubles(at=600), r"Doubles adds .*600, .*edits\(30000\)"),
+        (Doubles(told=(500, 500)), "Doubles.edits: steps .*in order"),
+        (Doubles(told=(0, 500)), "Doubles.edits: steps .*1 to 30000"),
+        (Unlimited(), r"Unlimited.limited\(205\) .*205 after step 500"),
+        (Doubles(at=0), "Doubles neither clones nor splits"),
     ],
 )
 def test_densifiers_that_are_wrong(densify, message):
@@ -210,8 +210,8 @@ class Idle(Sound):
 @pytest.mark.parametrize(
     ("prune", "message"),
     [
-        (Multiplies(), "Multiplies adds points after step 1; make it a Densify"),
-        (Idle(), "Idle drops no point at any of the steps that were tried, .* or the check says nothing"),
+        (Multiplies(), "Multiplies adds .*1; .*Densify"),
+        (Idle(), "Idle drops no point"),
         (Ints(), "Ints: drop is torch.float32, not bool"),
     ],
 )
@@ -254,8 +254,8 @@ class Tosses(Small):
     [
         (Weights(), "Weights.admits gives torch.float32, not bool"),
         (Surfels(), r"Surfels.admits has shape \(200, 2\), not \(200,\)"),
-        (Takes(), "Takes.admits changed its input want; work on a copy"),
-        (Tosses(), "Tosses.admits is not repeatable; draw from a generator with `step.seed`"),
+        (Takes(), "Takes.admits changed .*want"),
+        (Tosses(), "Tosses.admits is not repeatable; .*`step.seed`"),
     ],
 )
 def test_filters_that_are_wrong(condition, message):
@@ -293,9 +293,9 @@ class Lifts(Total):
     ("signal", "message"),
     [
         (Lengths(), r"Lengths.combine has shape \(60,\), not \(60, 2\)"),
-        (Ratio(), "Ratio.combine of chosen losses without gradient is not finite"),
-        (Lifts(), "Lifts.combine is not 0 for points that are not seen"),
-        (Total(terms="ssim"), "Total.terms is 'ssim'; it must be None or a tuple of names of losses"),
+        (Ratio(), "Ratio.combine .*without gradient is not finite"),
+        (Lifts(), "Lifts.combine is not 0"),
+        (Total(terms="ssim"), "Total.terms is 'ssim'; .*None .*tuple"),
     ],
 )
 def test_signals_that_are_wrong(signal, message):

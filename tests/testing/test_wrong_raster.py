@@ -80,13 +80,13 @@ class Blind(Own):
 @pytest.mark.parametrize(
     ("rasterizer", "message"),
     [
-        (Upside(), r"Upside of surfels: 'color': \d+% of the values are not those of the reference"),
-        (Halves(), "Halves of surfels: the gradient of 'opacities' is off by 50% of its norm"),
+        (Upside(), r"Upside of surfels: 'color': \d+%"),
+        (Halves(), "Halves of surfels: .*'opacities' .*50%"),
         (Flat(), "Flat of surfels: the map 'normal' is not there"),
-        (Noisy(), "Noisy.render is not repeatable: color differs; sum in a fixed order"),
-        (Lenient(), "Lenient draws a splat at NaN; raise BadInput"),
-        (Counts(), r"Counts of surfels: the sum of contribution: \d+% of the values are not those of the reference"),
-        (Blind(), r"Blind of surfels: \d+ splats are blended into pixels, but not `seen`"),
+        (Noisy(), "Noisy.render is not repeatable: color"),
+        (Lenient(), "Lenient draws .*NaN"),
+        (Counts(), r"Counts of surfels: .*contribution: \d+%"),
+        (Blind(), r"Blind of surfels: \d+ .*`seen`"),
     ],
 )
 def test_rasterizers_that_are_wrong(rasterizer, message):

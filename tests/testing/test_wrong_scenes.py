@@ -92,17 +92,17 @@ class Rolls(Sparse):
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        (Double(), r"Double: xyz is torch.float64 of shape \(400, 3\), not torch.float32 of shape \(400, 3\)"),
+        (Double(), r"Double: xyz is torch.float64 .*not torch.float32"),
         (Shades(), "Shades: rgb is torch.float32 of shape"),
         (Opaque(), "Opaque: opacity must lie between 0 and 1"),
         (Long(), "Long: a normal is not of length 1"),
-        (Tosses(), "Tosses.cloud is not repeatable: xyz differs; draw from the generator"),
-        (Shifts(), "Shifts.cloud changed its input known.scene.cloud.xyz; work on a copy"),
-        (Guesses(), "Guesses.expected is 40000, and the start gives 400 points"),
-        (Lacks(), "Lacks.model has the columns .* and those of 400 points are .*quats"),
+        (Tosses(), "Tosses.cloud is not repeatable: xyz"),
+        (Shifts(), "Shifts.cloud changed .*known.scene.cloud.xyz"),
+        (Guesses(), "Guesses.expected is 40000, .* 400 "),
+        (Lacks(), "Lacks.model has .*400 points .*quats"),
         (Fewer(), r"Fewer.model has the columns .*\(399, 3\)"),
         (Learnt(), "Learnt.model: sh_degree is 4, not 0 to 3"),
-        (Rolls(), r"Rolls.model is not repeatable: params\['quats'\] differs; draw from the generators"),
+        (Rolls(), r"Rolls.model is not repeatable: params\['quats'\]"),
     ],
 )
 def test_starts_that_are_wrong(start, message):
@@ -229,10 +229,10 @@ class Few(Same):
 @pytest.mark.parametrize(
     ("refine", "message"),
     [
-        (Whitens(), r"Whitens.begin changed its input params\['sh0'\]; work on a copy"),
-        (Narrows(), "Narrows: the column 'sh_rest' has shape .*, declared as"),
-        (Some(), "Some: its views are not the same again; draw them from the seed"),
-        (Few(), "Few has photographs of the training views only"),
+        (Whitens(), r"Whitens.begin changed .*params\['sh0'\]"),
+        (Narrows(), "Narrows: .*'sh_rest' has shape .*declared"),
+        (Some(), "Some: its views .*seed"),
+        (Few(), "Few has photographs"),
     ],
 )
 def test_refinements_that_are_wrong(refine, message):

@@ -94,16 +94,16 @@ class Moves(Ball):
 @pytest.mark.parametrize(
     ("mesher", "message"),
     [
-        (Inwards(), "Inwards: most of the mesh faces away from the cameras"),
-        (Long(), r"Long: faces are int64 of shape \(512, 3\); they must be a numpy array of int32 and shape \(n, 3\)"),
-        (Beyond(), "Beyond: a face names a vertex that is not there"),
+        (Inwards(), "Inwards: .*faces away"),
+        (Long(), r"Long: faces are int64 of shape \(512, 3\); .*int32 .*\(n, 3\)"),
+        (Beyond(), "Beyond: a face names"),
         (Holes(), "Holes: a vertex is not finite"),
         (Empty(), "Empty: there is no face"),
-        (Arrays(), "Arrays: mesh.json cannot keep the facts: ndarray cannot be saved"),
-        (Infinite(), "Infinite: mesh.json cannot keep the facts: set cannot be saved"),
+        (Arrays(), "Arrays: mesh.json .*facts: ndarray"),
+        (Infinite(), "Infinite: mesh.json .*facts: set"),
         (Draws(), "Draws: the same splats give another surface"),
-        (Moves(), "Moves.mesh changed its input splats.means; work on a copy"),
-        (Ball(radius=0.7), "Ball: 100% of the mesh lies farther than a tenth of the radius from the ball"),
+        (Moves(), "Moves.mesh changed .*splats.means"),
+        (Ball(radius=0.7), "Ball: 100% of the mesh"),
     ],
 )
 def test_meshers_that_are_wrong(mesher, message):
@@ -154,9 +154,9 @@ class Clears(Even):
     [
         (Negative(), "Negative.within is below 0 for some pixel"),
         (One(), r"One.among has shape \(\), not \(48, 64\)"),
-        (Divides(), "Divides.among, where no view has a depth, is not finite"),
-        (Nobody(), "Nobody.within leaves out 100% of the pixels of a true depth map"),
-        (Clears(), "Clears.within changed its input maps.depth; work on a copy"),
+        (Divides(), "Divides.among, .*not finite"),
+        (Nobody(), "Nobody.within .*100% of the pixels"),
+        (Clears(), "Clears.within changed .*maps.depth"),
     ],
 )
 def test_trusts_that_are_wrong(trust, message):

@@ -114,7 +114,7 @@ def test_a_cut_file_is_noticed_and_two_damaged_ones_are_named(begin, tmp_path):
     path.write_bytes(path.read_bytes()[:-1])
     assert load_last(path)[0].index == 0
     before(path).write_bytes(b"")
-    with pytest.raises(BadInput, match=r"c.safetensors is no readable .*; .*c-before.safetensors is no readable"):
+    with pytest.raises(BadInput, match=r"c\.safetensors .*; .*c-before\.safetensors"):
         load_last(path)
 
 
@@ -173,7 +173,7 @@ def test_columns_that_do_not_fit_are_named(begin, tmp_path):
     _, state = begin(STAGE)
     state.points.exp_avg["sh0"] = state.points.exp_avg["sh0"][:-1].clone()
     save(tmp_path / "c.safetensors", state)
-    with pytest.raises(BadInput, match=r"first.sh0 has shape \(39, 1, 3\) for 40 points"):
+    with pytest.raises(BadInput, match=r"first.sh0 .*\(39, 1, 3\) .*40 points"):
         load(tmp_path / "c.safetensors")
 
 

@@ -155,7 +155,7 @@ def test_frozen_points_that_do_not_fit_are_refused(begin, tmp_path):
         _, state = begin(QUIET)
         spoil(cut(state, torch.arange(40) < 15).frozen)
         checkpoint.save(path, state)
-        with pytest.raises(BadInput, match=r"c.safetensors: its frozen points do not fit the others; delete it"):
+        with pytest.raises(BadInput, match="c.safetensors: .*frozen points"):
             checkpoint.load(path)
 
 

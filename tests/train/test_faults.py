@@ -31,11 +31,11 @@ def saved(out):
 @pytest.mark.parametrize("fails", [real_cpu_error, python_error, cuda_error])
 def test_out_of_memory_says_what_to_lower(fails, tmp_path):
     told = rf"{tmp_path}: out of (GPU )?memory.*--longest.*--pretrain.densify.threshold"
-    with pytest.raises(Fault, match=f"{told}.*; no checkpoint is written yet, and .* the same command may do"):
+    with pytest.raises(Fault, match=f"{told}.*; no checkpoint"):
         with in_one_line(tmp_path):
             fails()
     saved(tmp_path)
-    with pytest.raises(Fault, match=f"{told}.*; the last checkpoint is whole, and .* the same command goes on from"):
+    with pytest.raises(Fault, match=f"{told}.*; the last checkpoint"):
         with in_one_line(tmp_path):
             fails()
 
@@ -84,7 +84,7 @@ def test_a_full_disk_is_one_line_that_claims_no_checkpoint_that_is_not_there(tmp
     if kept is not None:
         (tmp_path / kept).parent.mkdir(parents=True)
         (tmp_path / kept).touch()
-    with pytest.raises(Fault, match=rf"^/dev/full: the disk is full \(No space left on device\)[;:] {told}"):
+    with pytest.raises(Fault, match=rf"^/dev/full: the disk is full \(.*\)[;:] {told}"):
         with in_one_line(tmp_path):
             file = os.open("/dev/full", os.O_WRONLY)
             try:

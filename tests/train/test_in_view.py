@@ -189,7 +189,7 @@ def test_gradients_that_are_too_large_name_step_and_view(begin):
     trainer, state = begin(replace(QUIET, losses={"l1": Steep()}))
     put_in_order(state.points)
     before = held(state.points)
-    with pytest.raises(Diverged, match=r"step 1, view \d.png: the gradients of the .* are not finite, or too large"):
+    with pytest.raises(Diverged, match=r"step 1, view \d.png: the gradients of"):
         trainer.step(state)
     assert all(torch.equal(value, before[name]) for name, value in state.points.params.items())
 

@@ -255,7 +255,7 @@ class DropAll(Prune):
 
 def test_a_run_without_points_stops(begin):
     trainer, state = begin(replace(QUIET, prune=(DropAll(),)))
-    with pytest.raises(BadInput, match="step 2 would drop every point; lower the culls"):
+    with pytest.raises(BadInput, match="step 2 .*every point; .*culls"):
         list(trainer.run(state))
 
 
@@ -269,7 +269,7 @@ class Broken(L1):
 
 def test_a_loss_that_is_not_finite_names_step_and_view(begin):
     trainer, state = begin(replace(QUIET, losses={"l1": Broken()}))
-    with pytest.raises(Diverged, match=r"step 1, view \d.png: the losses are") as error:
+    with pytest.raises(Diverged, match=r"step 1, view \d.png: the losses") as error:
         list(trainer.run(state))
     assert error.value.index == 1 and error.value.view in {view.name for view in trainer.views}
 
@@ -285,7 +285,7 @@ class Spoiling(Prune):
 
 def test_parameters_that_are_not_finite_name_step_and_view(begin):
     trainer, state = begin(replace(QUIET, prune=(Spoiling(),)))
-    with pytest.raises(Diverged, match=r"step 3, view \d.png: the scales are not finite"):
+    with pytest.raises(Diverged, match=r"step 3, view \d.png: the scales"):
         list(trainer.run(state))
 
 
@@ -322,7 +322,7 @@ def test_damaged_photographs_are_passed_over_and_named_once(begin, monkeypatch):
     assert {shown.count(name) for name in ("0.png", "2.png", "3.png", "5.png")} == {3}, "all others, evenly"
     assert [event.name for event in said if isinstance(event, PhotoSkipped)] in (["1.png", "4.png"], ["4.png", "1.png"])
     monkeypatch.setattr(Damaged, "bad", range(6))
-    with pytest.raises(BadInput, match="none of the 6 photographs can be read, 0.png for one"):
+    with pytest.raises(BadInput, match="6 photographs .*0.png for one"):
         list(replace(trainer, stage=replace(QUIET, steps=20)).run(state))
 
 
@@ -335,7 +335,7 @@ def test_the_degree_of_the_harmonics_never_falls(begin):
 
 
 def test_stages_that_make_no_sense_are_refused(begin):
-    with pytest.raises(BadInput, match="names normal; the losses are l1, ssim"):
+    with pytest.raises(BadInput, match="normal; the losses are l1, ssim"):
         Stage(signal=LossGradient(terms=("normal",)))
     with pytest.raises(BadInput, match="0 steps"):
         Stage(steps=0)

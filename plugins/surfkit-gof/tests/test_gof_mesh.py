@@ -73,7 +73,7 @@ def test_splats_out_of_view_give_no_points():
     far = replace(given.splats, means=given.splats.means + 100)
     both = replace(given, splats=given.splats.and_then(far))
     assert len(in_view(both).splats) == 300
-    with pytest.raises(BadInput, match="none of 300 splats lies in any of 6 views"):
+    with pytest.raises(BadInput, match="300 splats .* 6 views"):
         OpacityField().mesh(replace(given, splats=far))
 
 

@@ -186,10 +186,10 @@ def test_the_mesher_finds_a_ball_in_renders_and_cleans_up(tmp_path):
 @compiled
 def test_nothing_in_the_range_is_refused_with_a_remedy(tmp_path):
     given = ball(scratch=tmp_path)
-    with pytest.raises(BadInput, match="no depth from 4 to 20 baselines.*--mesh.baseline"):
+    with pytest.raises(BadInput, match="4 to 20.*--mesh.baseline"):
         RenderedStereo(baseline=0.01).mesh(replace(given, views=given.views[:1]))
     assert not list(tmp_path.iterdir())
-    with pytest.raises(BadInput, match="mesh.nearest is 0.1.*larger nearest"):
+    with pytest.raises(BadInput, match="mesh.nearest is 0.1.*larger"):
         RenderedStereo(nearest=0.1, farthest=0.2).mesh(ball(scratch=tmp_path))
     with pytest.raises(BadInput, match="no views"):
         RenderedStereo().mesh(ball(views=()))

@@ -392,15 +392,15 @@ def test_growth_keeps_the_contract():
 def test_other_points_and_wrong_settings_are_refused():
     points = Points.fresh({"means": torch.zeros(2, 3)})
     _, _, step = grown_case()
-    with pytest.raises(BadInput, match="anchor-growth adds and drops anchors only; choose primitive:anchors"):
+    with pytest.raises(BadInput, match="anchor-growth.*primitive:anchors"):
         AnchorGrowth().watch(points, step)
-    with pytest.raises(BadInput, match="primitive.sh_degree is 2; anchors have colours from a network"):
+    with pytest.raises(BadInput, match="primitive.sh_degree is 2"):
         Anchors(sh_degree=2)
     with pytest.raises(BadInput, match="start.levels is 40"):
         AnchorVoxels(levels=40)
-    with pytest.raises(BadInput, match=r"kept is 0 and shown 0.8 \(above 0, up to 1\)"):
+    with pytest.raises(BadInput, match=r"kept is 0 .*shown 0\.8"):
         AnchorGrowth(kept=0)
-    with pytest.raises(BadInput, match="primitive anchors: PLY files of splats have no place for it"):
+    with pytest.raises(BadInput, match="anchors: PLY files"):
         SMALL.table(model())
 
 

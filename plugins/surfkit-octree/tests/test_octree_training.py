@@ -120,7 +120,7 @@ def test_a_run_has_levels_maps_and_no_ply(source, tmp_path, capsys):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["images"]["psnr"] > 8 and not (out / "point_cloud.ply").exists()
     notes = json.loads((out / "run.json").read_text())["notes"]
-    assert "no point_cloud.ply: PLY files of splats have no place for anchors" in notes
+    assert any("no point_cloud.ply" in text and "anchors" in text for text in notes)
     capsys.readouterr()
     assert report([str(out)]) == 0
     rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()]

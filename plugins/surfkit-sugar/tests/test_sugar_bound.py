@@ -187,7 +187,7 @@ def test_adjacent_normals_of_a_fold_are_1_minus_its_cosine():
 def test_parts_that_need_a_mesh_say_so():
     with pytest.raises(BadInput, match="refine.0:bind-to-mesh"):
         AdjacentNormals()(splats())
-    with pytest.raises(BadInput, match="mesh:bound needs splats that are bound"):
+    with pytest.raises(BadInput, match="mesh:bound needs splats"):
         BoundMesh().mesh(mesh_input())
     with pytest.raises(BadInput, match="cannot be moved"):
         MeshBound().moved({}, torch.zeros(0, 3))
@@ -249,7 +249,7 @@ def test_meshes_are_simplified_to_the_pixels_there_are(simplification):
 
 def test_recipes_that_densify_bound_splats_are_refused(simplification):
     wrong = evolve(REFINED, "refine.0.stage.densify", ADC())
-    with pytest.raises(BadInput, match="refine.0.stage.densify: the points of primitive mesh-bound can be neither"):
+    with pytest.raises(BadInput, match="refine.0.stage.densify: .*mesh-bound"):
         wrong.refuse_unfit()
 
 
@@ -277,7 +277,7 @@ def finished(simplification, data, tmp_path_factory):
 
 def test_a_mesher_that_cannot_work_is_told_before_anything_is_written(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(BadInput, match="mesh:sugar needs the package open3d"):
+    with pytest.raises(BadInput, match="mesh:sugar needs .*open3d"):
         run(replace(RECIPE, refine=(BindToMesh(),)), data, tmp_path / "run", Compute("cpu"), EVERY)
     assert not (tmp_path / "run").exists()
 

@@ -121,7 +121,7 @@ def test_the_mesher_keeps_to_the_contract(open3d):
 
 
 def test_splats_too_faint_for_the_level_are_refused(open3d):
-    with pytest.raises(BadInput, match=r"crosses 0\.999 before .* of .* pixels"):
+    with pytest.raises(BadInput, match=r"crosses 0\.999 .*pixels"):
         LevelSetPoisson(level=0.999, points=2_000).mesh(faint())
 
 
@@ -132,7 +132,7 @@ def faint():
 
 def test_without_open3d_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "open3d", None)
-    with pytest.raises(BadInput, match="mesh:sugar needs the package open3d"):
+    with pytest.raises(BadInput, match="mesh:sugar needs .*open3d"):
         LevelSetPoisson().ready()
 
 

@@ -81,4 +81,4 @@ def test_what_is_about_a_data_set_is_refused_without_one(capsys, words):
     assert main(["doctor", *words]) == 2
     said = capsys.readouterr()
     word = next(word for word in words if word != "--json")
-    assert said.err == f"surfkit: {word} is about a data set; name its folder: surfkit doctor DATA\n" and not said.out
+    assert said.err.startswith(f"surfkit: {word} is ") and said.err.endswith(": surfkit doctor DATA\n") and not said.out

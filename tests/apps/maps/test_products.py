@@ -225,7 +225,7 @@ def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
         ("EPSG:32633", 0.3048, "EPSG:32633 is in units of metre"),
         ("EPSG:5513", 1.0, "its axes point south and west"),
         ("EPSG:2048", 1.0, "its axes point west and south"),
-        ("EPSG:3857", 1.0, r"lengths on the map are 1\.\d+ times those on the ground here, areas [12]\.\d+ times"),
+        ("EPSG:3857", 1.0, r"lengths on the map are 1\.\d+ times .*[12]\.\d+ times"),
     ],
 )
 def test_a_system_that_would_make_volumes_wrong_is_refused(tmp_path, crs, metres, said):

@@ -129,7 +129,7 @@ def files_of(folder):
 @pytest.mark.parametrize("name", ["dsm.tif", "hillshade.tif", "maps.json"])
 def test_files_of_another_program_are_not_replaced(tmp_path, name):
     (tmp_path / name).write_text("of another program")
-    with pytest.raises(OSError, match=f"surfkit did not write, .*: '{name}'; name another folder"):
+    with pytest.raises(OSError, match=f"did not write, .*: '{name}';"):
         make_maps(MeshWithPhotos(hill(4.0), FRAME), SETTINGS, tmp_path)
     assert files_of(tmp_path) == {name: b"of another program"}
 
@@ -144,7 +144,7 @@ def test_beside_our_maps_too(tmp_path, monkeypatch):
     stopped(monkeypatch, MeshWithPhotos(hill(4.0), FRAME), few, tmp_path)
     before = files_of(tmp_path)
     for settings, other in ((replace(SETTINGS, products=("hillshade",)), None), (few, hill(3.0))):
-        with pytest.raises(OSError, match="surfkit did not write, .*: '(hillshade.tif|difference.png)';"):
+        with pytest.raises(OSError, match="did not write, .*: '(hillshade.tif|difference.png)';"):
             make_maps(MeshWithPhotos(hill(4.0), FRAME), settings, tmp_path, other)
     assert files_of(tmp_path) == before
     make_maps(MeshWithPhotos(hill(4.0), FRAME), less, tmp_path)

@@ -97,7 +97,7 @@ def test_without_points_the_middle_is_what_the_cameras_look_at():
 def test_cameras_that_stand_in_one_place():
     scene = survey()
     one = replace(scene, train=scene.train[:1] * 3)
-    with pytest.raises(BadInput, match="--path flyover: all training cameras stand above one place"):
+    with pytest.raises(BadInput, match="--path flyover: .*one place"):
         flyover(one, LENS, 4)
 
 
@@ -149,12 +149,12 @@ def test_a_camera_path_of_nerfstudio(tmp_path):
     [
         ("[]", "no cameras in it"),
         ('{"camera_path": []}', "no cameras in it"),
-        ('[{"position": [0, 0, 1]}]', "camera 0: rotation must be 3 x 3 finite numbers"),
+        ('[{"position": [0, 0, 1]}]', "camera 0: rotation .* 3 x 3"),
         ('[{"position": [0, 0, "a"], "rotation": [[1,0,0],[0,1,0],[0,0,1]]}]', "camera 0: position must be 3 finite"),
         ('[{"position": [0, 0, 1], "rotation": [[1,0,0],[0,1,0],[0,0,-1]]}]', "camera 0: its rotation is no rotation"),
         ('[{"position": [0, 0, 1], "rotation": [[2,0,0],[0,2,0],[0,0,2]]}]', "camera 0: its rotation is no rotation"),
-        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "camera 0: camera_to_world must be 16 finite numbers"),
-        ('{"camera_path": [3]}', "camera 0: camera_to_world must be 16 finite numbers"),
+        ('{"camera_path": [{"camera_to_world": [1, 2]}]}', "camera 0: camera_to_world .*16"),
+        ('{"camera_path": [3]}', "camera 0: camera_to_world .*16"),
     ],
 )
 def test_damaged_paths_are_one_line(tmp_path, data, said):
@@ -166,7 +166,7 @@ def test_damaged_paths_are_one_line(tmp_path, data, said):
 def test_a_field_of_view_that_cannot_be(tmp_path):
     row = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 180}
     (tmp_path / "path.json").write_text(json.dumps({"camera_path": [row]}))
-    with pytest.raises(BadInput, match="fov is 180; give degrees between 0 and 180"):
+    with pytest.raises(BadInput, match="fov is 180; .*0 .*180"):
         from_file(tmp_path / "path.json", survey().frame, LENS, 3)
 
 
@@ -223,7 +223,7 @@ def test_frames_go_on_where_they_stopped(tmp_path, warned):
         {"cameras": [replace(camera, fx=61.0) for camera in cameras]},
     ):
         given = {"cameras": cameras, "show": "color", "of": "model"} | other
-        with pytest.raises(BadInput, match="frames of another model, path or size"):
+        with pytest.raises(BadInput, match="another model, path or size"):
             draw_frames(folder, draw=Drawing(), **given)
     anew = Drawing()
     draw_frames(folder, cameras[:5], anew, "color", "model", replace=True)
@@ -233,7 +233,7 @@ def test_frames_go_on_where_they_stopped(tmp_path, warned):
 def test_a_folder_of_other_things_is_left_alone(tmp_path):
     (tmp_path / "000000.png").write_bytes(b"mine")
     for replace_frames in (False, True):
-        with pytest.raises(BadInput, match=f"it has files but no {FRAMES_RECORD}"):
+        with pytest.raises(BadInput, match=f"no {FRAMES_RECORD}"):
             draw_frames(tmp_path, [LENS], Drawing(), "color", "model", replace_frames)
     assert (tmp_path / "000000.png").read_bytes() == b"mine"
 

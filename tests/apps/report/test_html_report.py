@@ -208,7 +208,7 @@ def test_pictures_keep_to_the_budget(tmp_path):
     budget = len(gallery.encode(picture, 720).uri)
     assert gallery.encode_all([picture], budget)[picture].width == 720
     assert gallery.encode_all([picture, picture], budget - 1)[picture].width == 540
-    with pytest.raises(BadInput, match="1 pictures take more than .* MB even at 400 pixels; lower --views"):
+    with pytest.raises(BadInput, match="1 pictures .* MB .*400.*--views"):
         gallery.encode_all([picture], len(one.uri) - 1)
 
 

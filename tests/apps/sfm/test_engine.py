@@ -61,7 +61,7 @@ def test_ctrl_c_just_when_the_work_is_cancelled(interruptible, monkeypatch):
 
 def test_what_work_returns_and_how_it_fails():
     assert engine.run("adding", lambda _: 1 + 1) == 2
-    with pytest.raises(BadInput, match=r"adding failed in pycolmap: two lines; delete"):
+    with pytest.raises(BadInput, match=r"adding failed.*: two lines;"):
         engine.run("adding", lambda _: (_ for _ in ()).throw(RuntimeError("two\nlines")))
     with pytest.raises(ZeroDivisionError):
         engine.run("adding", lambda _: 1 / 0)
@@ -69,7 +69,7 @@ def test_what_work_returns_and_how_it_fails():
 
 def test_an_old_pycolmap_is_named(monkeypatch):
     monkeypatch.setattr(engine, "load_pycolmap", lambda: SimpleNamespace(__version__="3.11.1"))
-    with pytest.raises(BadInput, match="needs pycolmap 4.2 or newer, this is 3.11.1"):
+    with pytest.raises(BadInput, match=r"pycolmap 4\.2 .*3\.11\.1"):
         engine.load_engine()
 
 

@@ -77,10 +77,7 @@ def test_no_more_frames_are_taken_than_asked_for(walk, tmp_path):
     with collect_notes() as notes:
         taken = take_frames(walk, tmp_path / "f", 0.005, 5)
     assert 3 <= len(taken.names) <= 5 and numbers(taken)[-1] > 36 and taken.step > 0.005
-    assert (
-        f"of 50 frames are taken, one each time that the picture moves by {taken.step:.0%} of its width"
-        in notes.texts[0]
-    )
+    assert "of 50 frames are taken" in notes.texts[0] and f"by {taken.step:.0%} of its width" in notes.texts[0]
 
 
 def test_frames_that_are_there_are_not_taken_again(walk, tmp_path, monkeypatch):
@@ -134,7 +131,7 @@ def test_what_is_no_video(tmp_path, content, capfd):
     (tmp_path / "x.mp4").write_bytes(content)
     assert main(["prepare", "photos", str(tmp_path / "x.mp4"), "--out", str(tmp_path / "s")]) == 2
     said = capfd.readouterr().err.strip().splitlines()[-1]
-    assert "x.mp4: OpenCV cannot read it; convert it to MP4 with H.264, or take frames with ffmpeg" in said
+    assert "x.mp4: OpenCV cannot read it" in said
 
 
 def test_a_video_that_is_cut_off_is_told(tmp_path):
@@ -171,7 +168,7 @@ def test_videos_in_a_folder_beside_photographs(walk, tmp_path, capsys):
     words = ["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), "--frame-step", "0.06", *QUICK]
     assert main(words) == 0
     said = capsys.readouterr().err
-    assert "1 videos are called as a photograph beside them, as live photos are: 'IMG_2.MOV'" in said
+    assert "live photos are: 'IMG_2.MOV'" in said
     assert "no frames are taken of 1 videos, 'broken.mp4'" in said
     report = json.loads((tmp_path / "s/report.json").read_text())
     assert report["photographs"] > 6
@@ -184,7 +181,7 @@ def test_without_opencv_one_line_names_the_extra(walk, tmp_path, monkeypatch, ca
     monkeypatch.setitem(sys.modules, "cv2", None)
     assert main(["prepare", "photos", str(walk), "--out", str(tmp_path / "s")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "taking frames of a video needs the package cv2" in said
+    assert said.count("\n") == 1 and "needs the package cv2" in said
     assert "pip install 'surfkit[video]'" in said
     with pytest.raises(BadInput, match="pip install"):
         take_frames(walk, tmp_path / "f", 0.04, 300)
@@ -193,7 +190,7 @@ def test_without_opencv_one_line_names_the_extra(walk, tmp_path, monkeypatch, ca
 def test_training_on_a_video_says_what_to_do(walk, tmp_path, capsys):
     words = ["train", "recipe:2dgs", "--out", str(tmp_path / "run"), "--data"]
     assert main([*words, str(walk)]) == 2
-    assert f"walk.mp4: a video; `surfkit prepare photos {walk}` finds the cameras" in capsys.readouterr().err
+    assert f"`surfkit prepare photos {walk}`" in capsys.readouterr().err
     assert main([*words, str(walk.parent)]) == 2
-    assert f"`surfkit prepare photos {walk.parent}` finds the cameras" in capsys.readouterr().err
+    assert f"`surfkit prepare photos {walk.parent}`" in capsys.readouterr().err
     assert bare_photographs(walk) == walk and bare_photographs(walk.parent) == walk.parent

@@ -104,7 +104,7 @@ def test_degrees_come_to_utm(tmp_path):
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
     ground = read_ground(tmp_path / "gcp_list.txt", "auto", SIZES)
     np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
-    with pytest.raises(BadInput, match="'P0', 'P1', 'P2' and 6 more is not in degrees, as line 1, 'EPSG:4326', says"):
+    with pytest.raises(BadInput, match="'P0', 'P1', 'P2' and 6 more .*line 1, 'EPSG:4326'"):
         read_ground(written(tmp_path / "gcp_list.txt", "EPSG:4326"), "auto", SIZES)
 
 
@@ -125,13 +125,13 @@ def test_other_systems_are_not_taken_for_utm_on_wgs84(tmp_path, first, crs, metr
 def test_photographs_of_equal_names_in_two_folders_are_told_apart(tmp_path, capsys):
     path = written(tmp_path / "gcp_list.txt")
     sizes = {f"{folder}/{name}": size for folder in ("100", "101") for name, size in SIZES.items()}
-    with pytest.raises(BadInput, match="'0.jpg' may be '100/0.jpg', '101/0.jpg'; write the folder too"):
+    with pytest.raises(BadInput, match="'0.jpg' .*'100/0.jpg', '101/0.jpg';"):
         read_ground(path, "auto", sizes)
     path.write_text(path.read_text().replace(" 0.jpg", " 101/0.jpg"))
     with collect_notes():
         ground = read_ground(path, "auto", dict.fromkeys(["101/0.jpg", "100/0.jpg", "b/1.jpg"], (400, 400)))
     assert set(ground.points[0].marks) == {"101/0.jpg", "b/1.jpg"}
-    assert "3 of its photographs are not in the folder, or cannot be used" in capsys.readouterr().err
+    assert "3 of its photographs are not" in capsys.readouterr().err
 
 
 def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
@@ -157,17 +157,17 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
     assert told() == []
     path.write_text("\n".join(lines).replace("EPSG:32633", "EPSG:32634"))
     (far,) = told()
-    assert "km from their positions in EXIF: is EPSG:32634 the system" in far
+    assert "EXIF: is EPSG:32634" in far
     exchanged = [lines[0]] + [" ".join([y, x, *rest]) for x, y, *rest in (line.split() for line in lines[1:])]
     path.write_text("\n".join(exchanged))
     upside, far = told()
-    assert re.search("upside down, 1. m below the ground, with .* view 3. degrees above the horizon", upside)
+    assert re.search("upside down, 1. m below .* view 3. degrees above", upside)
     assert "96 km from" in far
     low = [lines[0]] + [" ".join([x, y, str(float(z) - 500), *rest]) for x, y, z, *rest in map(str.split, lines[1:])]
     path.write_text("\n".join(low))
     sea, below = told()
     assert re.search("[34].. m below zero", sea)
-    assert re.search("5.. m below their altitudes in EXIF: do the heights of the list count up", below)
+    assert re.search("5.. m below their altitudes in EXIF", below)
     path.write_text("\n".join([lines[0]] + ["5" + line for line in exchanged[1:]]))  # where no zone reaches
     with pytest.raises(BadInput, match="x is east and y north"):
         read_ground(path, "auto", SIZES)
@@ -190,7 +190,7 @@ def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):
 
 def test_too_few_points_and_points_on_a_line(tmp_path):
     ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", SIZES)
-    with pytest.raises(BadInput, match="9 of its 9 points are marked .* 3 are needed besides 7 --checkpoints"):
+    with pytest.raises(BadInput, match="9 of its 9 .* 3 .* 7 --checkpoints"):
         read_ground(tmp_path / "gcp_list.txt", "auto", SIZES, 7)
     found = place_by_points(model(), ground, 7)
     assert isinstance(found, NoSimilarity) and "3 are needed besides 7 checkpoints" in found.reason
@@ -208,10 +208,10 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
         ("EPSG:32633\n1 2 3 4 x a.jpg", "line 2"),
         ("EPSG:32633\n1 2 nan 4 5 a.jpg", "not finite"),
         ("EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 9 4 5 1.jpg P", "puts 'P' elsewhere"),
-        ("EPSG:32633\n1 2 3 4 5 a.jpg", "none of its photographs is in the folder: 'a.jpg'"),
+        ("EPSG:32633\n1 2 3 4 5 a.jpg", "none .*in the folder: 'a.jpg'"),
         ("EPSG:32633", "no points"),
-        ("EPSG:32633\n1 2 3 4 500 0.jpg P", "'P' is marked at 4 500 in '0.jpg', outside of its 400 x 400 pixels"),
-        ("EPSG:32633\n1 2 3 4 5 0.jpg\n1 2 3 4 5 1.jpg", "1 of its 1 points are marked in 2 or more photographs"),
+        ("EPSG:32633\n1 2 3 4 500 0.jpg P", "'P' .*4 500 .*'0.jpg', .*400 x 400"),
+        ("EPSG:32633\n1 2 3 4 5 0.jpg\n1 2 3 4 5 1.jpg", "1 of its 1 .*2 or more"),
         ("EPSG:32633" + "".join(f"\n{x} {x * x} 3 4 5 {y}.jpg" for x in range(3) for y in range(2)), "--crs EPSG:2180"),
     ],
 )  # fmt: skip

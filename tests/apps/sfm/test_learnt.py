@@ -161,9 +161,9 @@ def test_what_networks_find_is_of_their_weights_and_the_same_again(weights):
         (
             DISK,
             "nowhere.pth",
-            r"--features.weights .*nowhere.pth: no such file; name one with the weights of features:disk",
+            r"--features.weights .*nowhere.pth: no such .*features:disk",
         ),
-        (DISK, "aliked.pth", "not the weights of features:disk: .* tensors are missing .* give https://"),
+        (DISK, "aliked.pth", "features:disk: .*missing .*https://"),
         (DISK, "text.pth", "torch cannot read weights from it"),
         (LightGlue, "disk.pth", "not the weights of matcher:lightglue for sift"),
         (LightGlue, "disk_lightglue.pth", "not the weights of matcher:lightglue for sift"),
@@ -183,5 +183,5 @@ def test_weights_that_cannot_be_downloaded_are_one_line(monkeypatch):
         if name.startswith("kornia.") and hasattr(module, "load_state_dict_from_url"):
             monkeypatch.setattr(module, "load_state_dict_from_url", unreachable)
     for part, given in ((DISK(), ()), (ALIKED(), ()), (LightGlue(), ("sift",))):
-        with pytest.raises(BadInput, match=r"weights cannot be downloaded: get https://\S+ on a machine .*no route"):
+        with pytest.raises(BadInput, match=r"weights .*https://\S+ .*no route"):
             part.refuse_missing(*given)

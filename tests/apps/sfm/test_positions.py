@@ -51,8 +51,8 @@ def test_xmp_gives_positions_signs_and_altitudes(settled):
         photo("side.jpg", (*SOUTH[:2], 12.5), no_reference=True, xmp_altitude=-12.4),
     )
     assert at == [SOUTH, SOUTH, (*SOUTH[:2], 7.0), (*SOUTH[:2], -12.4)]
-    assert "1 photographs have their position in XMP only, which is used: 'only.jpg'" in said
-    assert "no letter of the hemisphere (N or S, E or W); the signs are those in XMP: 'signs.jpg'" in said
+    assert "XMP only, which is used: 'only.jpg'" in said
+    assert "those in XMP: 'signs.jpg'" in said
     assert "GPSAltitudeRef" not in said
 
 
@@ -66,7 +66,7 @@ def test_exif_and_xmp_that_contradict_each_other(settled):
 def test_photographs_near_by_tell_the_sign(settled):
     found, at, said = settled(photo(position=SOUTH), photo("b.jpg", HERE, unsigned=BOTH), photo("c.jpg"))
     assert at == [SOUTH, SOUTH, None] and found.open == ()
-    assert "EXIF of 1 photographs has no letter of the hemisphere" in said and "near by that have: 'b.jpg'" in said
+    assert "EXIF of 1 photographs has no letter" in said and "near by that have: 'b.jpg'" in said
     found, at, _ = settled(photo(position=(10.0, 10.0, 1.0)), photo("b.jpg", HERE, unsigned=("latitude",)))
     assert found.open == ("latitude",)
     assert [[p.exif.position for p in choice] for choice in found.readings()] == [
@@ -110,12 +110,9 @@ def test_a_list_comes_first_then_geo_txt_then_exif(settled, tmp_path):
     found, at, said = settled(*photos, files={"geo.txt": GEO + "gone.jpg 333000 6247100 3\n"})
     assert at[0][2] == 99 and at[1:] == [SOUTH, None] and found.crs == "EPSG:32756"
     assert found.photos[0].exif.accuracy_m == (0.02, 0.02, 0.05)
-    assert "geo.txt: 1 of its photographs are not in the folder: 'gone.jpg'" in said
-    assert "geo.txt gives the positions of 1 photographs in EPSG:32756, instead of those in EXIF of 1" in said
-    assert (
-        "2 are not in it, and keep the position in EXIF if they have one: 'sub/b.jpg', 'c.jpg'" in said
-        and "km from" not in said
-    )
+    assert "geo.txt: 1 of its photographs" in said
+    assert "1 photographs in EPSG:32756, instead of" in said
+    assert ": 'sub/b.jpg', 'c.jpg'" in said and "km from" not in said
     path = tmp_path / "table.csv"
     path.write_text("label,longitude,latitude,altitude\nB,151.2,-33.9,7\n")
     found, at, said = settled(*photos, settings=Settings(positions=path))
@@ -130,20 +127,20 @@ def test_geo_txt_in_the_folder_above_and_one_of_other_photographs(settled, tmp_p
     _, at, said = settled(photo(position=SOUTH))
     assert at == [SOUTH] and "geo.txt names none of the photographs and is not used" in said
     (tmp_path / "geo.txt").write_text("EPSG:4326\nmy notes on the geometry\n")
-    with pytest.raises(BadInput, match="line 2 is .*; geo.txt is read as OpenDroneMap's list of positions: mend it"):
+    with pytest.raises(BadInput, match="line 2 is .*; geo.txt"):
         settled(photo(position=SOUTH))
 
 
 def test_a_list_far_from_exif_is_told(settled):
     _, _, said = settled(photo(position=HERE), files={"geo.txt": GEO})
-    assert "km from their positions in EXIF: is its system the right one" in said
+    assert "km from their positions" in said
 
 
 @pytest.mark.parametrize(
     "text, said",
     [
-        ("other.jpg,1,2,3", "names none of the 2 photographs, such as '1/a.jpg'"),
-        ("a.jpg,1,2,3", "'a.jpg' may be '1/a.jpg', '2/a.jpg'; write the folder"),
+        ("other.jpg,1,2,3", "none of the 2 .*'1/a.jpg'"),
+        ("a.jpg,1,2,3", "'a.jpg' .*'1/a.jpg', '2/a.jpg';"),
         ("1/a.jpg,1,2,3\n1/A.jpg,1,2,4", "'1/a.jpg' and '1/A.jpg' both name|may be"),
     ],
 )

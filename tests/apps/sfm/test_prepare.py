@@ -274,7 +274,7 @@ def test_without_gps_it_is_level_and_features_are_kept(folder, prepared, tmp_pat
     shutil.copytree(prepared, tmp_path / "s")
     seen = watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), "--no-gps", *QUICK]) == 0
-    assert "sparse/0 is level but not on the map and of no known scale: --no-gps" in capsys.readouterr().err
+    assert "no known scale: --no-gps" in capsys.readouterr().err
     assert seen == []
     scene = read(Data(tmp_path / "s"))
     assert scene.frame.crs is None
@@ -322,9 +322,7 @@ def test_photographs_that_do_not_overlap(folder, tmp_path, capsys):
         save(tmp_path / "p" / f"{at}.jpg", picture(arc(1)[0], seed=20 + at))
     assert main(["prepare", "photos", str(tmp_path / "p"), *QUICK]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert (
-        "no cameras could be found for 3 photographs ('0.jpg', '1.jpg' and 1 more: matches no other photograph)" in said
-    )
+    assert "3 photographs ('0.jpg', '1.jpg' and 1 more: matches no other" in said
 
 
 def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path, capsys):
@@ -443,9 +441,7 @@ def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared,
     words = ["--gcp", str(tmp_path / "gcp_list.txt"), *QUICK]
     assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 0
     said = capsys.readouterr().err
-    assert (
-        "by the ground control points the photographs would be upside down, 1" in said and "m below the ground" in said
-    )
+    assert "upside down, 1" in said and "m below the ground" in said
     assert read(Data(tmp_path / "s")).frame.crs is None
 
 
@@ -459,8 +455,8 @@ def test_geo_txt_places_it_instead_of_exif(folder, prepared, tmp_path, monkeypat
     assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert seen == [], "only the place is another"
     said = capsys.readouterr().err
-    assert "geo.txt gives the positions of 6 photographs in EPSG:32633, instead of those in EXIF of 6" in said
-    assert "geo.txt puts the photographs 2 km from their positions in EXIF" in said
+    assert "6 photographs in EPSG:32633, instead of" in said
+    assert "2 km from their positions" in said
     for name, centre in cameras(read(Data(tmp_path / "s"))).items():
         assert np.linalg.norm(centre - CENTRES[name] - ORIGIN - move) < 0.2
     rows = [" ".join(row.split()[:4]) for row in rows]  # without heights: "view 0.jpg", x and y

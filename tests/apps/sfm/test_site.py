@@ -75,14 +75,14 @@ def test_without_both_letters_half_a_turn_is_left_open_unless_a_system_decides()
     assert isinstance(found, Placement) and "S 151.19" in said[0]
     found, _ = decided(photographs(""), "EPSG:28356")  # GDA94 / MGA zone 56
     assert isinstance(found, Placement) and found.chart.crs == "EPSG:28356"
-    with pytest.raises(BadInput, match="--crs EPSG:2180 is not meant for where the photographs are"):
+    with pytest.raises(BadInput, match="--crs EPSG:2180 is not"):
         decided(photographs(""), "EPSG:2180")
 
 
 def test_a_wrong_letter_is_refused():
     found, _ = decided(photographs(east=-1.0))
     assert isinstance(found, NoSimilarity)
-    assert "upside down, 40 m below the ground, with a mean direction of view 90 degrees above" in found.reason
+    assert "upside down, 40 m below" in found.reason and "view 90 degrees" in found.reason
 
 
 def test_cameras_that_fit_no_sign():

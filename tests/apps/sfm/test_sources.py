@@ -141,7 +141,7 @@ def test_masks_of_the_user_in_the_scene_are_not_replaced(folder, capsys):
     mine.parent.mkdir(parents=True)
     Image.new("L", (8, 8)).save(mine)
     assert main([*words, "--masks", str(folder / "m")]) == 2
-    assert "0.jpg.png is there, and this command did not make it" in capsys.readouterr().err
+    assert "0.jpg.png is there" in capsys.readouterr().err
     assert photo_size(mine) == (8, 8)
 
 
@@ -149,12 +149,12 @@ def test_masks_that_do_not_fit_are_told(folder):
     Image.new("L", (WIDTH, HEIGHT), 255).save(folder / "m/nobody.png")
     with collect_notes() as notes:
         sources_of(folder, masks=folder / "m")
-    assert f"--masks {folder / 'm'}: 1 masks have the name of no photograph: 'nobody.png'" in notes.texts
+    assert any(text.startswith(f"--masks {folder / 'm'}: 1 ") and "'nobody.png'" in text for text in notes.texts)
     Image.new("L", (WIDTH, HEIGHT // 2), 255).save(folder / "m/flight/1.png")
-    with pytest.raises(BadInput, match=r"1.png: 240 x 90 px is not the shape of its photograph"):
+    with pytest.raises(BadInput, match=r"1\.png: 240 x 90 px"):
         sources_of(folder, masks=folder / "m")
     (folder / "empty").mkdir()
-    with pytest.raises(BadInput, match="empty: no picture in it has the name of a photograph; call masks NAME.jpg.png"):
+    with pytest.raises(BadInput, match="empty: .*NAME.jpg.png"):
         sources_of(folder, masks=folder / "empty")
     with pytest.raises(BadInput, match="no such folder of masks"):
         sources_of(folder, masks=folder / "nowhere")
@@ -190,7 +190,7 @@ def test_without_pillow_heif_one_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "b.HEIC").write_bytes(b"x")
     (tmp_path / "c.heic").write_bytes(b"x")
-    said = r"reading 2 HEIC photographs needs the package pillow_heif, .*pip install 'surfkit\[heic\]'"
+    said = r"2 HEIC .*pillow_heif, .*pip install 'surfkit\[heic\]'"
     with pytest.raises(BadInput, match=said):
         look(tmp_path)
     save(tmp_path / "a.jpg", picture(arc(1)[0]))

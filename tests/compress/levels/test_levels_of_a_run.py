@@ -211,12 +211,12 @@ def stranger():
 
 def test_wrong_levels_of_a_stranger_are_one_line(copy, stranger, capsys):
     assert main(["lod", str(copy), "lod:half"]) == 2
-    assert "lod:half returned levels that cannot be used: its first level has not each of" in capsys.readouterr().err
+    assert "lod:half returned levels that cannot be used: its first" in capsys.readouterr().err
     assert (copy / "lod" / "lod.json").exists(), "what was there is kept"
 
 
 def test_levels_that_do_not_fit_are_refused_before_training(data, recipe, stranger, tmp_path):
-    with pytest.raises(BadInput, match="^lod: colours of one degree or more are needed"):
+    with pytest.raises(BadInput, match="^lod: .*one degree"):
         run(replace(recipe, lod=Half(), primitive=Surfel2D(sh_degree=0)), data, tmp_path / "run", Compute("cpu"))
     assert not (tmp_path / "run" / "pretrain").exists()
 

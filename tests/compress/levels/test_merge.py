@@ -324,9 +324,9 @@ def test_columns_of_strangers(monkeypatch):
     merged = merged_model(model, np.array([0, 0, 1, 1]), np.array([1.0, 3, 1, 1]))
     assert merged.params["heat"].tolist() == [[1.5, 2.5], [5.0, 6.0]] and merged.params["glow"].shape == (3,)
     assert 0 < float(merged.splats.opacities.max()) < 1
-    with pytest.raises(BadInput, match=r"cannot merge splats of primitive balls: .*quats is not so; choose lod:prune"):
+    with pytest.raises(BadInput, match=r"balls: .*quats is not .*lod:prune"):
         lod.refuse_unfit(Balls())
-    with pytest.raises(BadInput, match="its column means is not what is drawn"):
+    with pytest.raises(BadInput, match="column means is not"):
         lod.refuse_unfit(Shifted())
 
 

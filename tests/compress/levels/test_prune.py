@@ -122,5 +122,5 @@ def test_wrong_settings(settings, text):
 def test_metres_must_be_known():
     given = lod_input(count=100)
     given = replace(given, frame=replace(given.frame, metres=None))
-    with pytest.raises(BadInput, match="give the length with --metres-per-unit"):
+    with pytest.raises(BadInput, match="length .*--metres-per-unit"):
         PrunedLevels(distances=(200.0, 400.0), steps=0).build(given)

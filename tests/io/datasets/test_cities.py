@@ -80,12 +80,12 @@ def test_depth_without_its_package_or_of_another_kind_is_said(tmp_path, truth, m
     path.write_bytes(path.read_bytes()[:200])
     with collect_notes() as notes:
         assert read_priors(data, scene)[2] is None and len(read(data).cloud.xyz) == 3 * 1165
-    assert "1 of 4 photographs train without a depth prior: cannot be read" in notes.texts[0]
-    assert f"1 of 4 depth maps give no points to start from, first {path}: cannot be read" in notes.texts[1]
+    assert "1 of 4 photographs train without" in notes.texts[0]
+    assert "1 of 4 depth maps" in notes.texts[1] and f"first {path}: cannot be read" in notes.texts[1]
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with collect_notes() as notes:
         assert read_priors(data, scene) is None
-    assert "needs the package OpenEXR, which is not installed: pip install 'surfkit[exr]'" in notes.texts[0]
+    assert "pip install 'surfkit[exr]'" in notes.texts[0]
     assert len(read(data).cloud.xyz) == RANDOM_POINTS
 
 
@@ -96,13 +96,13 @@ def test_the_split_of_gauu_scene(tmp_path):
     held = [view.name for view in read(Data(tmp_path, split=GauUScene())).held_out]
     assert held == ["view_007.png", "view_015.png", "view_023.png"]
     assert [view.name for view in read(Data(tmp_path)).held_out] == ["view_000.png", "view_008.png", "view_016.png"]
-    with pytest.raises(BadInput, match="--split, --test-list and --test-data each choose"):
+    with pytest.raises(BadInput, match="--split, --test-list and --test-data"):
         Data(tmp_path, split=GauUScene(), test_list=Path("a.txt"))
 
 
 def test_the_split_of_gauu_scene_needs_the_numbers_of_colmap(tmp_path, truth):
     data = nerfstudio(tmp_path, truth)
-    with pytest.raises(BadInput, match="^--split gauu-scene: is for COLMAP data sets; leave it out$"):
+    with pytest.raises(BadInput, match="^--split gauu-scene: .*COLMAP"):
         read(Data(data, split=GauUScene()))
 
 

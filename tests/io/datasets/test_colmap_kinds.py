@@ -62,16 +62,14 @@ def test_the_largest_of_several_models_is_used(farm):
     (model / "points3D.txt").write_text("".join(" ".join(line.split()[:8]) + "\n" for line in points))
     scene, notes = noticed(Data(farm))
     assert len(scene.train) + len(scene.held_out) == 5
-    assert (
-        len(notes) == 1 and "several models, each of photographs of its own: sparse/0 of 2, sparse/1 of 5" in notes[0]
-    )
+    assert len(notes) == 1 and "sparse/0 of 2, sparse/1 of 5" in notes[0]
     assert "sparse/1 is used, choose another with --model" in notes[0]
     small, notes = noticed(Data(farm, model=Path("sparse/0"), test_every=0))
     assert [view.name for view in small.train] == ["view_000.png", "view_001.png"] and not notes
-    with pytest.raises(BadInput, match="--model .*sparse/2: no COLMAP model"):
+    with pytest.raises(BadInput, match="--model .*sparse/2: no COLMAP"):
         read(Data(farm, model=Path("sparse/2")))
     (model / "cameras.txt").unlink()
-    with pytest.raises(BadInput, match="sparse/0: the COLMAP model lacks cameras.txt"):
+    with pytest.raises(BadInput, match="sparse/0: .*lacks cameras.txt"):
         read(Data(farm, model=Path("sparse/0")))
     shutil.rmtree(model)
     assert len(read(Data(farm)).train) == 4, "a lone sparse/1 does too"
@@ -79,7 +77,7 @@ def test_the_largest_of_several_models_is_used(farm):
 
 def test_points_that_images_refer_to_must_be_there(farm):
     (farm / "sparse" / "0" / "points3D.txt").write_text("")
-    with pytest.raises(BadInput, match="sparse/0: its images refer to 3D points, and the file of points has none"):
+    with pytest.raises(BadInput, match="sparse/0: .*3D points.* none"):
         read(Data(farm))
 
 
@@ -92,11 +90,11 @@ def test_exif_that_turns_photographs_is_ignored_and_said(farm):
         path.unlink()
     seen = np.asarray(load_pycolmap().Bitmap.read(str(farm / "images/view_001.jpg"), True).to_array())
     scene, notes = noticed(Data(farm))
-    assert "5 of 5 photographs have an EXIF tag that turns them, view_000.png for one: it is ignored" in notes[-1]
+    assert "5 of 5 photographs have an EXIF tag" in notes[-1] and "view_000.png" in notes[-1]
     photo = view_photo(scene.train[0]).permute(1, 2, 0).numpy()
     assert photo.shape == (48, 64, 3) and np.abs(photo.astype(int) - seen).max() <= 2
     (farm / "sparse/0/cameras.txt").write_text("1 PINHOLE 48 64 58 57 24 31\n")
-    with pytest.raises(BadInput, match=r"\(turned by 90 degrees\).* turned as EXIF says, so save them like that"):
+    with pytest.raises(BadInput, match=r"\(turned by 90 degrees\).*EXIF"):
         read(Data(farm))
 
 
@@ -119,7 +117,7 @@ def test_a_spelling_that_fits_two_files_is_none(farm):
         (images / side).mkdir()
         shutil.copy(images / "view_002.png", images / side)
     (images / "view_002.png").unlink()
-    with pytest.raises(BadInput, match="1 of 5 photographs are missing: 'view_002.png'"):
+    with pytest.raises(BadInput, match="1 of 5 .*missing: 'view_002.png'"):
         read(Data(farm))
 
 
@@ -258,5 +256,5 @@ def test_a_folder_that_cannot_be_written_uses_the_cache_of_the_user(farm, monkey
 
 def test_layouts_by_name(farm):
     assert len(read(Data(farm, layout="colmap")).train) == 4
-    with pytest.raises(BadInput, match="no Reader named 'colmpa'; did you mean 'colmap'?"):
+    with pytest.raises(BadInput, match="no Reader .*'colmpa'; .*'colmap'"):
         read(Data(farm, layout="colmpa"))

@@ -158,7 +158,7 @@ def test_opendronemap_with_tracks(tmp_path, truth):
     assert tracks.error_px[seen].max() < 1e-3, "on the map, too"
     assert not observations(Data(folder), read(Data(folder))).is_empty
     (folder / "opensfm/tracks.csv").write_text("\n".join(lines).replace("0.001", "x").replace("\t7\t", "\t7\tx"))
-    with pytest.raises(BadInput, match="tracks.csv: a place in 'view_000.png' is no number"):
+    with pytest.raises(BadInput, match="tracks.csv: .*'view_000.png' .*number"):
         reader_of(Data(folder)).tracks(Data(folder))
 
 
@@ -210,7 +210,7 @@ def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, t
     from surfkit.testing.synthetic import write_colmap
 
     odm(nerfstudio(tmp_path, truth), truth)
-    with pytest.raises(BadInput, match="could be of layout nerfstudio or odm; choose one with --layout"):
+    with pytest.raises(BadInput, match="nerfstudio or odm; .*--layout"):
         read(Data(tmp_path))
     assert len(read(Data(tmp_path, layout="nerfstudio", test_every=0)).train) == 6
     write_colmap(tmp_path, truth)
@@ -323,7 +323,7 @@ def test_two_focal_lengths_of_opensfm(tmp_path, truth, kind):
 def test_a_missing_photograph_of_opendronemap_is_skipped(tmp_path, truth):
     folder = odm(tmp_path, truth)
     sorted((folder / "images").iterdir())[1].unlink()
-    with pytest.raises(BadInput, match="1 of 6 photographs are missing: .*--missing skip"):
+    with pytest.raises(BadInput, match="1 of 6 .*missing: .*--missing skip"):
         read(Data(folder))
     assert len(read(Data(folder, test_every=0, missing="skip")).train) == 5
 
@@ -342,11 +342,11 @@ def without(*names, **more):
     [
         (
             without("w", "h", cx=40, cy=30),
-            "principal point 40, 30 is that of a photograph of about 80 x 60 px, and .* 40 x 30",
+            "principal point 40, 30 .*80 x 60 px.* 40 x 30",
         ),
         (without("w", "h", cx=10, cy=7.5), "photograph of about 20 x 15 px"),
         (without("w", "h", cx=20, cy=31), "photograph of about 40 x 62 px"),
-        (without("h", w=80), "w is 80, and .* has 40 x 30 px; give w and h"),
+        (without("h", w=80), "w is 80.* 40 x 30 px; .*w and h"),
     ],
 )
 def test_a_camera_of_photographs_of_another_size(tmp_path, truth, change, words):

@@ -94,7 +94,7 @@ def test_a_folder_by_name(farm):
     put(farm / "people/view_002.png")
     assert scene_of(farm)[0].train[2].mask is None
     assert scene_of(farm, masks=Path("people"))[0].train[2].mask == Mask(farm / "people/view_002.png")
-    with pytest.raises(BadInput, match="--masks .*none: no such folder of masks"):
+    with pytest.raises(BadInput, match="--masks .*none: no such"):
         scene_of(farm, masks=Path("none"))
 
 
@@ -106,10 +106,10 @@ def test_masks_that_fit_no_photograph_are_noticed(farm):
 
 def test_a_mask_of_another_shape_or_a_damaged_one_is_named(farm):
     put(farm / "masks/view_001.png", left_black((40, 20)))
-    with pytest.raises(BadInput, match="view_001.png: 40 x 20 px is not the shape of its photograph"):
+    with pytest.raises(BadInput, match=r"view_001\.png: 40 x 20 px"):
         scene_of(farm)
     (farm / "masks/view_001.png").write_bytes(b"<html>")
-    with pytest.raises(BadInput, match="masks/view_001.png: not a whole picture"):
+    with pytest.raises(BadInput, match="masks/view_001.png: not a whole"):
         scene_of(farm)
 
 

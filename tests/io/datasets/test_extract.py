@@ -74,7 +74,7 @@ def test_priors_without_the_sparse_model(farm, tmp_path):
 
 def test_files_that_cannot_be_used(farm, tmp_path):
     path = tmp_path / "views.npz"
-    with pytest.raises(BadInput, match=r"views.npz is not there; .*surfkit train"):
+    with pytest.raises(BadInput, match="views.npz is not .*surfkit train"):
         extract.load(path)
     assert not extract.is_whole(path)
     _, scene, priors = farm

@@ -122,9 +122,9 @@ def test_a_split_with_a_setting_of_its_own(farm):
     scene = read(Data(root, split=Lowest(3)))
     heights = {v.name: v.camera.centre[2].item() for v in (*scene.train, *scene.held_out)}
     assert {v.name for v in scene.held_out} == set(sorted(heights, key=heights.__getitem__)[:3])
-    with pytest.raises(BadInput, match="^--split lowest holds out all 6 photographs"):
+    with pytest.raises(BadInput, match="^--split lowest .*all 6"):
         read(Data(root, split=Lowest(6)))
-    with pytest.raises(BadInput, match="^--split wrong holds out 'nobody.png', which is no photograph"):
+    with pytest.raises(BadInput, match="^--split wrong .*'nobody.png'"):
         read(Data(root, split=Wrong()))
 
 
@@ -182,7 +182,7 @@ def test_a_reader_of_higher_priority_than_colmap(farm):
     with collect_notes() as notes:
         assert read(Data(root)).frame.metres == 7
     assert notes.texts == [f"{root}: read as marked; it could also be read with --layout colmap"]
-    with pytest.raises(BadInput, match="--model sparse/0: a data set of layout marked has no such model; leave it out"):
+    with pytest.raises(BadInput, match="--model sparse/0: .*layout marked"):
         read(Data(root, model=Path("sparse/0")))
 
 
@@ -201,13 +201,11 @@ def test_on_the_command_line(farm, tmp_path, capsys):
     again = shlex.split(train_command(opened(tmp_path / "run")))[1:]
     assert main(again) == 0 and "is finished" in capsys.readouterr().err
     assert main([*words, *chosen, "--split.count", "2"]) == 2
-    assert "holds a run with data.split.count 1, and this one has 2" in capsys.readouterr().err
+    assert "data.split.count 1, and this one has 2" in capsys.readouterr().err
     assert main([*words, "--split", "loest"]) == 2
-    assert "no split named 'loest'; did you mean 'lowest'? known: gauu-scene, lowest, wrong, none" in (
-        capsys.readouterr().err
-    )
+    assert "'loest'; did you mean 'lowest'? known: gauu-scene, lowest, wrong, none" in capsys.readouterr().err
     assert main([*words, "--split"]) == 2
-    assert "--split: one of gauu-scene, lowest, wrong, none must follow" in capsys.readouterr().err
+    assert "--split: one of gauu-scene, lowest, wrong, none" in capsys.readouterr().err
     assert main(["doctor", str(root), "--quick", *chosen]) in (0, 1)
     assert "lowest" in capsys.readouterr().out
 
@@ -217,5 +215,5 @@ def test_a_run_of_before_has_the_name_of_its_split_alone(tmp_path):
     (tmp_path / "run.json").write_text(json.dumps({"data": before}))
     assert read_data(tmp_path) == Data(Path("farm"), split=GauUScene())
     (tmp_path / "run.json").write_text(json.dumps({"data": before | {"split": "gone"}}))
-    with pytest.raises(BadInput, match="run.json: data.split: no Split named 'gone'; known: gauu-scene, lowest, wrong"):
+    with pytest.raises(BadInput, match="run.json: data.split: .*'gone'; known: gauu-scene, lowest, wrong"):
         read_data(tmp_path)

@@ -81,9 +81,7 @@ def test_how_far_the_earth_bends_below_a_reconstruction_is_told(tmp_path, away, 
     if said is None:
         assert found == []
     else:
-        off = float(
-            re.search(r"'EPSG:32632' is flat: at the outermost camera, coordinates are ([.\d]+) m off", found[0])[1]
-        )
+        off = float(re.search(r"'EPSG:32632' is flat: .* ([.\d]+) m off", found[0])[1])
         assert off == pytest.approx(said, abs=0.06), "the map is scaled too, heights with it"
 
 
@@ -172,12 +170,12 @@ def test_an_offset_that_is_none(tmp_path):
     write_splats(tmp_path / "a.ply", table, frame=frame)
     path = tmp_path / "a.ply"
     path.write_bytes(path.read_bytes().replace(b"1000000 0 0", b"1000000 a 0"))
-    with pytest.raises(BadInput, match="the header has offset '1000000 a 0', not three numbers"):
+    with pytest.raises(BadInput, match="offset '1000000 a 0'.*three"):
         read_splats(path)
 
 
 def test_the_unit_that_a_user_gives():
-    with pytest.raises(BadInput, match="--metres-per-unit 0: it must be more than 0"):
+    with pytest.raises(BadInput, match="--metres-per-unit 0: .*more than 0"):
         Data(None, metres_per_unit=0)
 
 
@@ -204,7 +202,7 @@ def test_heights_of_a_file_beside_a_model_may_have_a_system_of_their_own(tmp_pat
     assert (frame.crs, frame.metres) == ("EPSG:25832+7837", 1.0)
     for wrong in ({"vertical_crs": "sea level"}, {"vertical_crs": "EPSG:7837", "crs": "EPSG:25832+5773"}):
         file.write_text(json.dumps(PLACED | wrong))
-        with pytest.raises(BadInput, match="vertical_crs is .* codes such as EPSG:5773"):
+        with pytest.raises(BadInput, match="vertical_crs .*EPSG:5773"):
             read(Data(tmp_path))
 
 
@@ -214,5 +212,5 @@ def test_two_files_that_put_a_colmap_model_in_two_places_are_refused(tmp_path):
         (tmp_path / place / "georeference.json").write_text(json.dumps(PLACED))
     assert read(Data(tmp_path)).frame.crs == "EPSG:25832"
     (tmp_path / "georeference.json").write_text(json.dumps(PLACED | {"crs": "EPSG:25833"}))
-    with pytest.raises(BadInput, match=r"sparse/0/georeference.json and .*/georeference.json differ"):
+    with pytest.raises(BadInput, match=r"sparse/0/georeference.json .*/georeference.json differ"):
         read(Data(tmp_path))

@@ -48,7 +48,7 @@ def test_no_more_is_read_than_connects_all(monkeypatch):
 
 def test_the_line_names_sizes_and_one_photograph_of_each_smaller_group():
     assert groups_warning([]) is groups_warning([["a", "b"]]) is None
-    assert "into 2 groups without common sparse points, of 3 and 1 ('d' for one): " in groups_warning(
+    assert "2 groups without common sparse points, of 3 and 1 ('d' for one): " in groups_warning(
         [["a", "b", "c"], ["d"]]
     )
     many = groups_warning([["a"] * 9, *([name] * (8 - at) for at, name in enumerate("bcdefg"))])

@@ -229,7 +229,7 @@ def test_lists_of_held_out_panoramas(tmp_path):
 def test_a_part_of_a_panorama_is_refused(tmp_path):
     colmap(tmp_path, tracks=False)
     Image.new("RGB", (WIDTH, 100)).save(tmp_path / "images/b.png")
-    with pytest.raises(BadInput, match="b.png: 256 x 100 px, a panorama that is not twice as wide as high"):
+    with pytest.raises(BadInput, match="b.png: 256 x 100 px.*twice"):
         read(Data(tmp_path))
 
 
@@ -306,7 +306,7 @@ def test_transparent_panoramas(tmp_path):
 def test_panoramas_that_are_missing_are_skipped(tmp_path):
     colmap(tmp_path)
     (tmp_path / "images/b.png").unlink()
-    with pytest.raises(BadInput, match=r"1 of 3 photographs are missing: 'b.png'.*--missing skip"):
+    with pytest.raises(BadInput, match="1 of 3 .*missing: 'b.png'.*--missing skip"):
         read(Data(tmp_path, test_every=0))
     data = Data(tmp_path, test_every=0, missing="skip")
     scene = read(data)
@@ -355,14 +355,14 @@ def test_views_of_the_name_of_another_photograph(tmp_path):
     path = tmp_path / "sparse/0/images.txt"
     path.write_text(path.read_text().replace("b.png", "a.jpg"))
     Image.open(tmp_path / "images/b.png").save(tmp_path / "images/a.jpg")
-    with pytest.raises(BadInput, match="the photograph 'a-back.png' is there twice"):
+    with pytest.raises(BadInput, match="'a-back.png' .*twice"):
         read(Data(tmp_path))
 
 
 def test_a_panorama_above_the_limit_of_the_user(tmp_path, monkeypatch):
     colmap(tmp_path, tracks=False)
     monkeypatch.setenv("SURFKIT_MAX_MEGAPIXELS", "0.02")
-    with pytest.raises(BadInput, match=r"a.png: 256 x 128 px .* more than the limit"):
+    with pytest.raises(BadInput, match="a.png: 256 x 128 px .*limit"):
         read(Data(tmp_path))
 
 
@@ -390,7 +390,7 @@ def test_every_line_says_how_panoramas_get_the_points_that_depth_maps_need(tmp_p
     data, out = str(tmp_path / "data"), str(tmp_path / "run")
     assert main(["doctor", data, "recipe:surface", "--quick", "--probe", "0"]) == 2
     said = [capsys.readouterr().out]
-    assert "error: the run begins at depth maps: there are no depth priors, and none can be made" in said[0]
+    assert "error: the run begins at depth maps" in said[0]
     for command in (["prepare", "depth"], ["train", "recipe:surface", "--out", out, "--data"]):
         assert main([*command, data]) == 2
         said.append(capsys.readouterr().err)

@@ -308,7 +308,7 @@ def test_groups_of_metashape_name_the_folders_of_equal_labels(tmp_path):
 def test_missing_photographs_of_other_programs_are_skipped(tmp_path, program):
     program(tmp_path)
     sorted(path for path in tmp_path.rglob("*") if path.suffix.lower() in (".jpg", ".png"))[1].unlink()
-    with pytest.raises(BadInput, match=r"1 of 4 photographs are missing: .*; --missing skip uses the others"):
+    with pytest.raises(BadInput, match="1 of 4 .*missing: .*--missing skip"):
         read(Data(tmp_path))
     with collect_notes() as kept:
         scene = read(Data(tmp_path, test_every=0, missing="skip"))
@@ -321,10 +321,8 @@ def test_terms_that_colmap_has_not(tmp_path):
     with collect_notes() as kept:
         read(Data(tmp_path))
     text = next(text for text in kept.texts if "no camera model of COLMAP has" in text)
-    assert re.search(r"1 of 1 lenses have terms .* \(k4, skew\): pixels are up to 0\.1\d off", text), text
-    with pytest.raises(
-        BadInput, match=r"sensor 0: no camera model of COLMAP has its skew: without, pixels are up to 1.2"
-    ):
+    assert re.search(r"1 of 1 lenses .*\(k4, skew\): .*0\.1\d off", text), text
+    with pytest.raises(BadInput, match=r"sensor 0: .*skew.* 1\.2"):
         metashape(tmp_path, b2=3.0)
         read(Data(tmp_path))
 
@@ -363,37 +361,37 @@ def entry(*path, value):
             partial(metashape, change=words("<transform>", "<transform>1 ")),
             "camera 'IMG 1': '1 .*, where 16 finite numbers",
         ),
-        (partial(metashape, change=words("<transform>", "<transform>9")), "camera 'IMG 1': the pose is not a rotation"),
-        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "IMG 1' stand for two photographs each"),
-        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 photographs are missing: 'IMG 5'"),
+        (partial(metashape, change=words("<transform>", "<transform>9")), "camera 'IMG 1': .*rotation"),
+        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "IMG 1' stand for two"),
+        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 .*missing: 'IMG 5'"),
         (partial(metashape, change=lambda t: t.replace("transform", "nothing")), "all 5 photographs have no pose"),
         (partial(metashape, tail="<transform><scale>0</scale></transform>"), "transform of the chunk: its scale is 0"),
         (
             partial(metashape, tail="<transform/><reference>PROJCS[</reference>"),
-            "reference: no coordinate reference system that pyproj reads: missing ]; export",
+            "reference: .*pyproj reads: missing ];",
         ),
         (
             partial(metashape, tail="<transform/><reference>x</reference>"),
-            "no coordinate reference system that pyproj reads: Invalid WKT string: x; export it again",
+            "pyproj reads: Invalid WKT string: x",
         ),
         (partial(pix4d, change=words("0 0 1\n", "0 1 1\n")), "IMG 1.png: the camera matrix has entries below"),
         (partial(pix4d, change=words("radial distortion [3x1]", "fisheye poly [4x1]")), "only perspective cameras are"),
-        (partial(pix4d, change=lambda t: t[: len(t) // 2]), "lines of cameras, of which each takes 10: cut off"),
+        (partial(pix4d, change=lambda t: t[: len(t) // 2]), "each takes 10: cut off"),
         (partial(pix4d, change=words("fileName", "name")), "does not begin with 'fileName imageWidth imageHeight'"),
-        (partial(pix4d, change=words("IMG 1.png 220", "IMG 1.png wide")), "is no photograph with its width and height"),
+        (partial(pix4d, change=words("IMG 1.png 220", "IMG 1.png wide")), "no photograph with"),
         (partial(pix4d, offset=(np.nan, 0, 0)), "survey_offset.xyz: 'nan 0 0.*', where 3 finite numbers belong"),
         (partial(realitycapture, change=words(",t1,t2", ",t1")), "it lacks t2; export it as"),
         (partial(realitycapture, change=words(",12.0,", ",north,")), "IMG 1.png: .*, where 15 finite numbers belong"),
         (partial(realitycapture, change=words("IMG 2.png,", "IMG 2.png,1,")), "line 3 has 17 values, not 16"),
         (partial(realitycapture, f=0), "IMG 1.png: no lens has size 220 x 160"),
-        (partial(bundler, change=words("v0.3", "v0.4")), "begins with '# Bundle file v0.4', not with"),
+        (partial(bundler, change=words("v0.3", "v0.4")), "'# Bundle file v0.4', not with"),
         (partial(bundler, change=words("5 20", "5 21")), "cut off or damaged at point 21 of 21"),
         (partial(bundler, change=words("5 20", "50 20")), "cut off: numbers of"),
-        (partial(bundler, change=words("190 -0.1", "x -0.1")), "something that is no number lies among the numbers"),
+        (partial(bundler, change=words("190 -0.1", "x -0.1")), "something that is no number"),
         (partial(bundler, change=words("190 -0.1", "nan -0.1")), "camera of 'IMG 1.png': focal length nan"),
         (partial(bundler, change=words("190 -0.1", "1e-320 -0.1")), "camera .* of IMG 1.png has size 220 x 160"),
         (partial(bundler, listed=lambda name: "" if "9" in name else name), "names 4 photographs, bundle.out has 5"),
-        (partial(openmvg, change=entry("extrinsics", value=[])), "sfm_data.json: no extrinsics in it; reconstruct"),
+        (partial(openmvg, change=entry("extrinsics", value=[])), "sfm_data.json: no extrinsics"),
         (partial(openmvg, change=entry("views", 0, "value", value=[])), "damaged, or not of OpenMVG: TypeError"),
         (
             partial(openmvg, change=entry("intrinsics", 0, "value", "polymorphic_name", value="spherical")),
@@ -403,7 +401,7 @@ def entry(*path, value):
             partial(
                 openmvg, change=entry("extrinsics", 1, "value", "rotation", value=[[1, 0, 0], [0, 1, 0], [0, 0, 2]])
             ),
-            "pose of 'IMG 2.png': the pose is not a rotation",
+            "pose of 'IMG 2.png': .*rotation",
         ),
         (partial(openmvg, change=entry("structure", 3, "value", "X", value=[1, 2])), "damaged, or not of OpenMVG"),
     ],
@@ -418,13 +416,13 @@ def test_what_is_damaged_or_cannot_be_kept(tmp_path, write, text):
 def test_two_exports_in_a_folder_need_a_choice(tmp_path):
     realitycapture(tmp_path)
     metashape(tmp_path)
-    with pytest.raises(BadInput, match="could be of layout metashape or realitycapture; choose one with --layout"):
+    with pytest.raises(BadInput, match="metashape or realitycapture; .*--layout"):
         read(Data(tmp_path))
     assert read(Data(tmp_path, layout="metashape", test_every=0)).train[0].name == "IMG 1"
     metashape(tmp_path)
     (tmp_path / "cameras.xml").rename(tmp_path / "b.xml")
     metashape(tmp_path)
-    with pytest.raises(BadInput, match="several files of cameras: 'b.xml', 'cameras.xml'; leave one"):
+    with pytest.raises(BadInput, match="several .*'b.xml', 'cameras.xml'"):
         read(Data(tmp_path, layout="metashape"))
 
 
@@ -455,7 +453,7 @@ def test_where_a_bundle_file_and_its_list_may_lie(tmp_path):
     assert len(read(Data(tmp_path, test_every=0)).train) == 4
     (tmp_path / "bundle").mkdir()
     (tmp_path / "flight.bundle.out").rename(tmp_path / "bundle/bundle.out")  # as Bundler does
-    with pytest.raises(BadInput, match="no list of the photographs beside it; put list.txt there"):
+    with pytest.raises(BadInput, match="no list .*list.txt"):
         read(Data(tmp_path))
     (tmp_path / "flight.list.txt").rename(tmp_path / "list.txt")
     assert len(read(Data(tmp_path, test_every=0)).train) == 4
@@ -554,7 +552,7 @@ def test_a_bundle_file_of_photographs_of_another_size(tmp_path, by, told):
     if told is None:
         assert len(read(Data(tmp_path, test_every=0)).train) == 4
     else:
-        with pytest.raises(BadInput, match=f"{told}.*smaller than the photographs that the cameras were found for"):
+        with pytest.raises(BadInput, match=f"{told}.*smaller"):
             read(Data(tmp_path, test_every=0))
 
 

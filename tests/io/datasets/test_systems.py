@@ -32,7 +32,7 @@ def test_spellings(text, crs):
 @pytest.mark.parametrize(
     "text, said",
     [
-        ("WGS84 UTM 38U", "has the letter 'U' after the zone of UTM; N or S belongs there"),
+        ("WGS84 UTM 38U", "letter 'U' .*N or S"),
         ("WGS84 UTM 38", "has no letter after the zone of UTM"),
         ("WGS84 UTM 61N", "zone 61 of UTM; they are 1 to 60"),
         ("EPSG:4978", "neither in degrees nor a map"),

@@ -77,12 +77,12 @@ def test_axes_that_are_not_named_are_told(tmp_path, records, flags):
         as_they_are = read_splat_file(tmp_path / "a.spz", "rdf").means
     assert means.tolist() == [[1, -2, -3]] and as_they_are.tolist() == [[1, 2, 3]]
     (note,) = notes.texts
-    assert "does not say which axes its numbers have: rub (right-up-back) is assumed; --axes rdf" in note
+    assert "rub (right-up-back) is assumed; --axes rdf" in note
 
 
 def test_records_that_are_damaged_are_refused(tmp_path):
     for records, text in (
-        (record(17), "axes by the number 17; 1 to 16 are known"),
+        (record(17), "number 17; 1 to 16"),
         (record(6)[:-1], "the record of its axes is cut off"),
         (struct.pack("<IIQ", 0xADBE0003, 8, 6), "the record of its axes is cut off"),
     ):

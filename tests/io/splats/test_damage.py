@@ -125,7 +125,7 @@ def test_absurd_counts_take_no_memory(tmp_path):
     assert most < 1 << 20 and "cut off after 0 of 1000000000000 rows of chunk" in said
     (tmp_path / "a.splat").write_bytes(bytes(33))
     _, said = peak(lambda: Splat().read(tmp_path / "a.splat"))
-    assert "33 bytes are no .splat file, which has 32 for each splat" in said
+    assert "33 bytes are no .splat file" in said
 
 
 def test_bombs_take_no_memory(tmp_path):
@@ -180,6 +180,6 @@ def test_names_in_meta_json_stay_in_the_archive(tmp_path):
     for name in ("../quats.webp", "/etc/passwd", "..", "", "a\\\\b", "quats.webp\\u0000"):
         text = meta.read_text()
         meta.write_text(text.replace('"quats.webp"', f'"{name}"'))
-        with pytest.raises(BadInput, match="quats.files has no name of a file at 0"):
+        with pytest.raises(BadInput, match="quats.files .*name .*at 0"):
             read_splat_file(meta)
         meta.write_text(text)

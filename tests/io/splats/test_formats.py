@@ -102,7 +102,7 @@ def test_nan_and_inf_are_refused(tmp_path, form, column):
     for value in (math.nan, math.inf, -math.inf):
         splats = table(count=9, degree=1)
         getattr(splats, column)[4, ...] = value
-        with pytest.raises(BadInput, match=rf"{column} of splat 4 of 9 has NaN, Inf or a value beyond 1e\+18; remove"):
+        with pytest.raises(BadInput, match=rf"{column} of splat 4 of 9 .*1e\+18"):
             form.write(tmp_path / f"a{form.suffix}", splats)
         assert not list(tmp_path.iterdir())
 
@@ -190,10 +190,10 @@ def test_spz_of_large_scenes(tmp_path):
     with collect_notes() as notes:
         there_and_back(SPZ(), far, tmp_path)
     assert "positions are 0.0625 apart" in notes.texts[0] and "x the median scale" in notes.texts[0]
-    with pytest.raises(BadInput, match="coordinates up to .* have no place in 24 bits with 8 after .*; at most 4"):
+    with pytest.raises(BadInput, match="24 bits with 8 .*; at most 4"):
         SPZ(fractional_bits=8).write(tmp_path / "b.spz", far)
     beyond = replace(far, means=far.means * 1e3)
-    with pytest.raises(BadInput, match="move the splats towards 0, or take another format"):
+    with pytest.raises(BadInput, match="towards 0, or .*another format"):
         SPZ().write(tmp_path / "b.spz", beyond)
 
 
@@ -210,9 +210,9 @@ def test_formats_are_known_by_what_they_hold(tmp_path):
             for ending in (".dat", ".splat"):
                 path = path.rename(tmp_path / f"{name}{ending}")
                 assert type(format_of(path)) is cls
-    with pytest.raises(BadInput, match=r"no format of splats has this suffix; known: .*sog \(.sog\)"):
+    with pytest.raises(BadInput, match=r"suffix; known: .*sog \(\.sog\)"):
         format_for(tmp_path / "a.xyz")
-    with pytest.raises(BadInput, match="no file of splats of a known format"):
+    with pytest.raises(BadInput, match="no file of splats"):
         format_of(tmp_path)
 
 

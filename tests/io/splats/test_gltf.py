@@ -352,5 +352,5 @@ def test_spz_data_of_another_count_is_refused(tmp_path):
     document, _ = parsed(tmp_path / "a.glb")
     data = spz_bytes(splat_table(count=29), 2, tmp_path)
     document["bufferViews"][0]["byteLength"] = len(data)
-    with pytest.raises(BadInput, match="29 splats in the SPZ data, and 30 by the accessors"):
+    with pytest.raises(BadInput, match="29 splats .*SPZ .* 30 by"):
         read_splats(glb(tmp_path / "b.glb", document, data + b"\0" * (-len(data) % 4)))

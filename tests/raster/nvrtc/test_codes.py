@@ -127,7 +127,7 @@ def test_bad_vectors_are_refused_as_on_the_cpu():
     vectors[7, 1] = torch.nan
     with simulated_gpu():
         for call in (lambda: kmeans(vectors, 2, device=GPU), lambda: nearest(vectors, drawn(3, 3), GPU)):
-            with pytest.raises(BadInput, match="vectors: row 7 has the value nan; values must be finite"):
+            with pytest.raises(BadInput, match="vectors: row 7 .*nan"):
                 call()
 
 

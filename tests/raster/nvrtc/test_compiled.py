@@ -88,14 +88,14 @@ def test_architectures(compiler, monkeypatch):
     chosen = {(7, 5): "sm_75", (8, 7): "sm_86", (8, 9): "sm_89", (9, 0): "sm_90", (10, 3): "sm_100", (12, 1): "sm_120"}
     assert {key: compiler.architecture(key) for key in chosen} == chosen
     assert compiler.architecture((13, 0)) == "compute_120"  # newer than the compiler
-    with pytest.raises(BadInput, match=r"compute capability 7\.0; surfkit with CUDA .* needs 7\.5 or newer; use"):
+    with pytest.raises(BadInput, match=r"capability 7\.0; .*7\.5"):
         compiler.architecture((7, 0))
 
 
 def test_mistakes_of_sources_are_shown(compiler, tmp_path):
     (tmp_path / "part.h").write_text("inline int f() { return unknown_name; }\n")
     (tmp_path / "bad.cu").write_text('#include "part.h"\nKERNEL(32) k(Buffer<int> x) { x[0] = f(); }\n')
-    with pytest.raises(RuntimeError, match=r'(?s)bad.cu does not compile for sm_80.*part.h\(1\).*"unknown_name"'):
+    with pytest.raises(RuntimeError, match=r'(?s)bad.cu .*sm_80.*part.h\(1\).*"unknown_name"'):
         compiler.compile(CudaSource(tmp_path / "bad.cu"), "sm_80")
 
 
@@ -144,7 +144,7 @@ def test_no_compiler_says_which_package(monkeypatch):
     for cuda, package in (("12.8", "nvidia-cuda-nvrtc-cu12"), ("13.0", "nvidia-cuda-nvrtc")):
         monkeypatch.setattr(torch.version, "cuda", cuda)
         nvrtc.cache_clear()
-        with pytest.raises(BadInput, match=f"found no NVRTC.*; pip install {package}$"):
+        with pytest.raises(BadInput, match=f"NVRTC.*; pip install {package}$"):
             nvrtc()
     nvrtc.cache_clear()
 
@@ -154,9 +154,7 @@ def test_no_driver():
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
-        with pytest.raises(
-            BadInput, match="--device cuda:0: found no NVIDIA driver .*; install one, or use --device cpu"
-        ):
+        with pytest.raises(BadInput, match="--device cuda:0: .*no NVIDIA driver.*--device cpu"):
             Driver(torch.device("cuda:0"))
     else:
         pytest.skip("has a driver, but no GPU")
@@ -181,7 +179,7 @@ class Refusing:
 def test_an_old_driver_is_named(monkeypatch):
     monkeypatch.setattr(ctypes, "CDLL", lambda name: Refusing(209))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (8, 0))
-    with pytest.raises(BadInput, match=r"no kernel image is available, 209\); update the driver, install a build"):
+    with pytest.raises(BadInput, match=r"209\); update the driver"):
         Driver(torch.device("cuda:0")).load(b"")
     monkeypatch.setattr(ctypes, "CDLL", lambda name: Refusing(2))
     with pytest.raises(RuntimeError, match="cuModuleLoadData on cuda:0"):

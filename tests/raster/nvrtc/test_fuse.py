@@ -175,7 +175,7 @@ def test_a_gpu_without_memory(monkeypatch):
     assert grid.fuse(first, False) and not grid.fuse(second, False) and grid.blocks == blocks
     allowed = 0
     made.clear()
-    with pytest.raises(BadInput, match="cpu: less than .* MB of its memory are free, too little to fuse depth maps in"):
+    with pytest.raises(BadInput, match="cpu: less than .* MB .*fuse"):
         GpuGrid(LATTICE, on.device, on).fuse(first, False)
 
 
@@ -185,7 +185,7 @@ def test_blocks_for_the_free_memory(monkeypatch):
     device = torch.device("cuda", 0)
     assert most_blocks(device) == free // 2 // BLOCK_BYTES
     free = 10_000_000
-    with pytest.raises(BadInput, match="cuda:0: less than 117 MB of its memory are free, .* --device cpu"):
+    with pytest.raises(BadInput, match="cuda:0: less than 117 MB .*--device cpu"):
         most_blocks(device)
 
 

@@ -131,7 +131,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker, "optimise", failing)
-        with pytest.raises(Unfinished, match="block 1 failed: numbers are not finite; the others are done") as told:
+        with pytest.raises(Unfinished, match="block 1 failed: .*not finite") as told:
             run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert told.value.status == 3
     assert read_state(tmp_path / "blocks" / "000").status == "done"
@@ -147,7 +147,7 @@ def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
     command = schedule.job_of
     monkeypatch.setattr(schedule, "FILE_ARRIVAL_S", 0.2)
     monkeypatch.setattr(schedule, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
-    with pytest.raises(Unfinished, match="block 1 failed: nothing of its work has come to"):
+    with pytest.raises(Unfinished, match="block 1 failed: nothing of"):
         run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
 
 
@@ -227,7 +227,7 @@ def test_a_longer_coarse_stage_makes_the_old_result_void(undisturbed, data, reci
     monkeypatch.setattr(pipeline, "optimise", stop_after(pipeline.optimise, STEPS + 3))
     with pytest.raises(KeyboardInterrupt):
         run(longer, data, tmp_path / "run", Compute("cpu"), EVERY)
-    with pytest.raises(BadInput, match=f"stopped after step {STEPS + 3} of {STEPS + 8}"):
+    with pytest.raises(BadInput, match=f"step {STEPS + 3} of {STEPS + 8}"):
         load_run(tmp_path / "run")
 
 
@@ -362,4 +362,4 @@ def test_an_inline_executor_is_the_default(recipe):
 def test_settings_of_blocks_where_there_are_none(data, tmp_path, capsys, word):
     words = ["train", "recipe:2dgs", *word, "--data", str(data.path), "--out", str(tmp_path / "run")]
     assert main(words) == 2 and not (tmp_path / "run").exists()
-    assert f"surfkit: {word[0]}: the recipe does not divide the scene into blocks" in capsys.readouterr().err
+    assert f"surfkit: {word[0]}: the recipe does not divide" in capsys.readouterr().err

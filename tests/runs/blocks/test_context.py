@@ -167,12 +167,10 @@ def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypa
     state = checkpoint.load(path)
     state.frozen = {}
     checkpoint.save(path, state)
-    with pytest.raises(
-        schedule.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"
-    ):
+    with pytest.raises(schedule.Unfinished, match="000/tune/checkpoint.safetensors .*no frozen points"):
         run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     assert checkpoint.load(path).index == 6 and "delete" in capsys.readouterr().err
-    with pytest.raises(BadInput, match='context "frozen", and this one has "tuned"'):
+    with pytest.raises(BadInput, match='context "frozen", .*"tuned"'):
         run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu"), EVERY)
 
 
@@ -255,9 +253,7 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path, capsys):
         6e6 / len(coarse.points), 3e6 / len(coarse.points), forecasts.DENSIFIED_GROWTH
     )
     forecasts.report_forecast(place.out, told_of_gpu)
-    assert (
-        f"a block needs up to {told_of_gpu.gpu_bytes / 1e6:.0f} MB of the memory of its GPU" in capsys.readouterr().err
-    )
+    assert f"needs up to {told_of_gpu.gpu_bytes / 1e6:.0f} MB" in capsys.readouterr().err
     around = plan.blocks[0].begins - plan.blocks[0].points
     assert found["densified"].memory - found["tuned"].memory == 2 * around * TRAINED_POINT_BYTES
     less = TRAINED_POINT_BYTES - FROZEN_POINT_BYTES

@@ -89,6 +89,6 @@ def test_it_is_part_of_the_recipe(other, data, tmp_path):
     assert [path for path, _, _ in other.stages()] == ["pretrain", "partition_pretrain", "tune"]
     assert Run(tmp_path, replace(other, partition_pretrain=None), data).partition is None
     whole = replace(other, partition=None)
-    with pytest.raises(BadInput, match="partition_pretrain: the recipe cuts the scene into no blocks; leave it out"):
+    with pytest.raises(BadInput, match="partition_pretrain: .*leave it out"):
         run(whole, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert not (tmp_path / "run" / "recipe.json").exists()

@@ -141,10 +141,10 @@ def test_what_is_lost_for_good_is_told(whole, data, agreeing, tmp_path, capsys):
     checkpoint.discard(out / "tune" / "checkpoint.safetensors")
     shutil.rmtree(out / "blocks" / "001")
     agreement_file(opened(out), 1).unlink()
-    with pytest.raises(Unfinished, match="block 1 goes on after step 5, and .*000001.* is gone; delete"):
+    with pytest.raises(Unfinished, match="block 1 .*step 5, .*000001.* is gone"):
         run(agreeing, data, out, Compute("cpu"), EVERY)
     shutil.rmtree(agreement_file(opened(out), 1).parent)
-    with pytest.raises(Unfinished, match="is of step 12, and what blocks agreed on after step 5 is gone; delete"):
+    with pytest.raises(Unfinished, match="step 12, .*step 5 is gone"):
         run(agreeing, data, out, Compute("cpu"), EVERY)
 
 

@@ -123,5 +123,5 @@ def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, m
     elsewhere(-LATER_S)
     monkeypatch.setattr(schedule, "STALE_S", 0.2)
     (folder / "tune" / "checkpoint.safetensors").unlink()
-    with pytest.raises(BadInput, match="000: process 7 on far works on the block; wait for its end"):
+    with pytest.raises(BadInput, match="000: process 7 on far"):
         run(recipe, data, folder, Compute("cpu"), EVERY)

@@ -80,7 +80,7 @@ def test_how_each_ended_the_largest_first(workers, tmp_path):
     jobs.append(job(tmp_path, 3, needs=(tmp_path / "elsewhere",)))
     ends = {end.job.index: end for end in workers.run(jobs)}
     assert {index: end.status for index, end in ends.items()} == {0: 0, 1: 1, 2: -9, 3: 2}
-    assert f"{tmp_path / 'elsewhere'} is not there; run folder and data set must lie" in ends[3].why
+    assert f"{tmp_path / 'elsewhere'} is not there" in ends[3].why
     assert ends[3].why.startswith(f"machine {os.uname().nodename}: ")
     printed = [(tmp_path / f"{index:03}" / LOG).read_text().split() for index in range(3)]
     assert sorted(range(3), key=lambda at: float(printed[at][0])) == [1, 2, 0]
@@ -201,7 +201,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
 
 
 def test_no_cluster_there(tmp_path):
-    with pytest.raises(BadInput, match=r"ray.address 127.0.0.1:1: no connection"):
+    with pytest.raises(BadInput, match="ray.address 127.0.0.1:1: "):
         list(Ray(address="127.0.0.1:1").run([job(tmp_path, 0)]))
 
 

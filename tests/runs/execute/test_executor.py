@@ -75,7 +75,7 @@ def test_pool_gives_each_process_a_gpu(tmp_path, monkeypatch):
 def test_pool_wants_no_more_gpus_than_there_are(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
     Pool(gpus=3).ready()
-    with pytest.raises(BadInput, match="pool.gpus is 4, and torch finds 3 GPUs here; give 0 to 3"):
+    with pytest.raises(BadInput, match="pool.gpus is 4, .*0 to 3"):
         Pool(gpus=4).ready()
 
 

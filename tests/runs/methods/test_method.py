@@ -209,7 +209,7 @@ def test_a_mesh_method_from_the_command_line(data, tmp_path, capsys):
     assert len(list((out / "mesh_pictures").glob("*.png"))) == 6
     capsys.readouterr()
     assert main([*words[:4], "6", *words[5:]]) == 2
-    assert "holds a run with method.steps 5, and this one has 6" in capsys.readouterr().err
+    assert "method.steps 5, and this one has 6" in capsys.readouterr().err
 
 
 def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data, tmp_path, capsys):
@@ -261,15 +261,13 @@ def test_what_the_method_does_not_use_is_refused_before_anything_is_written(data
         assert main([*words, *more]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert "method:lower does not use it" in line and more[0] in line, line
-    with pytest.raises(
-        BadInput, match="^partition: method:lower does not use it; leave it out, or choose method:splats"
-    ):
+    with pytest.raises(BadInput, match="^partition: method:lower .*leave it out.*method:splats"):
         run(replace(Recipe(method=Lower()), partition=QuantileGrid()), data, tmp_path / "run")
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({"method": {"use": "lower"}, "context": "tuned"}))
     assert main(["train", f"recipe:{path}", *words[3:]]) == 2 and "context: method:lower" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    with pytest.raises(BadInput, match="method:broken makes no optimisation steps; leave it out"):
+    with pytest.raises(BadInput, match="method:broken .*leave it out"):
         with_steps(Recipe(method=Broken()), 10)
     assert with_steps(Recipe(method=Lower()), 10) == Recipe(method=Lower(steps=10))
 
@@ -278,10 +276,10 @@ def test_data_that_do_not_fit_and_wrong_results_are_one_line(data, tmp_path, cap
     with pytest.raises(BadInput, match="the plane does not fit"):
         run(Recipe(method=Lower(wrong=True)), data, tmp_path / "unfit")
     for how, said in {
-        "nothing": "returned no mesh, no splats and nothing that draws",
-        "faces": "a mesh of 121 vertices with a face that names vertex 220",
+        "nothing": "no mesh, no splats",
+        "faces": "121 vertices .* vertex 220",
         "nan": "NaN or Inf",
-        "kind": r"\(121, 3\) float64; they must be \(V, 3\) float32",
+        "kind": r"\(121, 3\) float64; .*\(V, 3\) float32",
     }.items():
         with pytest.raises(BadInput, match=said):
             run(Recipe(method=Broken(how)), data, tmp_path / how)
@@ -338,7 +336,7 @@ def test_a_table_compares_methods_with_splats(data, tmp_path):
     lengths = [trial.recipe.length for trial in trials(AblationPlan(table, (data,), tmp_path, steps=6))]
     assert lengths == [6, 4, None]
     wrong = replace(table, rows=(Row("both", {"method": Lower(), "pretrain.steps": 7}),))
-    with pytest.raises(BadInput, match="row 'both': pretrain.steps: method:lower does not use it"):
+    with pytest.raises(BadInput, match="row 'both': pretrain.steps: method:lower"):
         build(wrong)
 
 
@@ -377,7 +375,7 @@ def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys, monkeypat
     assert not (tmp_path / "alone" / "pretrain").exists()
     words = ["train", "recipe:2dgs", "method:stereo", "--data", str(data.path), "--out", str(tmp_path / "none")]
     assert main(words) == 2 and not (tmp_path / "none").exists()
-    assert "let the run make them with depth:patch-match and without --no-prepare" in capsys.readouterr().err
+    assert "depth:patch-match and without --no-prepare" in capsys.readouterr().err
     trust = replace(SURFACE.mesh.trust, covered_by=0)  # where stereo has no depth, nobody would seem to look
     fusion = replace(SURFACE.mesh, largest_px=0.0, oversampling=1.0, sky=True, trust=trust)
     assert STEREO.method.mesher.fusion == fusion, "it has no splats"

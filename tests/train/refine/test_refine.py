@@ -179,13 +179,13 @@ def test_the_time_left_is_that_of_the_refinement(finished, tmp_path):
 
 
 def test_numbers_that_stay_infinite_name_the_rates_of_the_refinement(data, recipe, tmp_path):
-    with pytest.raises(NotFinite, match=r"lower refine\.1\.stage\.rates in another folder"):
+    with pytest.raises(NotFinite, match=r"lower refine\.1\.stage\.rates"):
         return_to_checkpoint(Run(tmp_path, recipe, data).last, 2, Diverged(3, "a.png", "infinite"), interrupt)
 
 
 def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):
     (tmp_path / "refine0").touch()
-    with pytest.raises(BadInput, match="refine0: a file, where the run keeps a folder"):
+    with pytest.raises(BadInput, match="refine0: a file"):
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
 
 
@@ -241,7 +241,7 @@ def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkey
 
 def test_depth_priors_teach_nothing_where_the_model_does():
     losses = Stage().losses | {"depth": DepthRegression()}
-    with pytest.raises(BadInput, match="refine.1: learns from what the model draws, where depth finds no depth priors"):
+    with pytest.raises(BadInput, match="refine.1: .*depth .*priors"):
         Recipe(refine=(PruneAndRecover(stage=Stage(losses=losses)), DistilSH(stage=Stage(losses=losses))))
 
 
