@@ -82,7 +82,7 @@ def _use_gpu(device: Device) -> str:
 
 def rasterizers(device: Device) -> Mapping[str, type[Rasterizer]]:
     """All rasterizers by name; BadInput if `device` is none of them and no device either."""
-    known = components(Rasterizer)
+    known = components(Rasterizer)  # type: ignore[type-abstract]
     if device not in (*DEVICES, *known) and not re.fullmatch(r"cuda:\d{1,3}", device):
         raise BadInput(unknown("--device", device, (*DEVICES, *known)))
     return known
