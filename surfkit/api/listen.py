@@ -19,7 +19,8 @@ class Listener:
     """A plugin that hears steps and warnings."""
 
     def __init__(self, on_step: OnStep | None = None) -> None:
-        self.on_step, self.texts = on_step, []
+        self.on_step = on_step
+        self.texts: list[str] = []
 
     @hookimpl
     def surfkit_event(self, event: object) -> None:

@@ -37,8 +37,14 @@ class RunMesh:
 
     @staticmethod
     def read(path: Path) -> RunMesh:
-        """The mesh in a file."""
+        """The mesh in a file.
+
+        Raises:
+            BadInput: It has no faces, or cannot be read.
+        """
         found = read_surface(path)
+        if found.faces is None:
+            raise BadInput(f"{path}: a cloud of points; name a mesh")
         names = found.rows.dtype.names or ()
         colors = [found.rows[name] for name in ("red", "green", "blue") if name in names]
         values = {name: np.asarray(found.rows[name]) for name in VALUES if name in names}

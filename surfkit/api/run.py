@@ -126,6 +126,7 @@ class TrainedRun:
         """
         ctx, made = self._loaded
         refuse_not_drawn(ctx.run)
+        assert made.draw is not None, "what is drawn has a way to draw"
         view = camera if isinstance(camera, View) else View("camera", camera, Path("camera"))
         with torch.no_grad():
             return made.draw(view)
@@ -154,6 +155,8 @@ class TrainedRun:
             chosen = evolve(chosen, name, value)
         if chosen is not None:
             chosen.ready()
+        maker = made.mesh if chosen is None else chosen
+        assert maker is not None, "where the method has made no mesh, a mesher does"
         budget = cache_bytes(memory, "memory")
         maps = nullcontext(run) if chosen is None else with_maps_to_mesh(run, chosen, scene, ctx.caches, self.device)
         with (
@@ -165,7 +168,7 @@ class TrainedRun:
             record_events(run.out),
         ):
             what = mesh_input(with_maps, made, scene, ctx.rasterizer, budget, chosen)
-            record = make_mesh(with_maps, chosen or made.mesh, output, what, made.last_steps)
+            record = make_mesh(with_maps, maker, output, what, made.last_steps)
         return RunMesh.read(run.out / record["files"][0])
 
     def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:

@@ -74,7 +74,7 @@ def _place(recipe: Any, slot: str) -> SlotPath | None:
     *path, last = slot.split(".")
     node, hint, taken = recipe, Any, []
     for step in path:
-        if is_dataclass(node) and (field := step.replace("-", "_")) in (hints := hints_of(type(node))):
+        if is_dataclass(kind := type(node)) and (field := step.replace("-", "_")) in (hints := hints_of(kind)):
             node, hint, step = getattr(node, field), hints[field], field
         elif isinstance(node, tuple) and step.isdecimal() and int(step) < len(node):
             node, hint = node[int(step)], Any

@@ -67,7 +67,7 @@ def _flags_of(owner: Any, kind: type, path: str, argv: Sequence[str]) -> Iterato
         named = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
         below = join(path, named[0] if named else field.name.replace("_", "-")) if named != [""] else path
         if chosen_recipe in marks:
-            value = recipes(argv).get(chosen_name(argv))
+            value = recipes(argv).get(chosen_name(argv) or "")
         elif owner is kind:
             value = field.default_factory() if callable(field.default_factory) else field.default
         else:

@@ -50,7 +50,7 @@ def rules_of_help() -> ConstructorRegistry:
         finally:
             asking.pop()
         if not isinstance(spec, StructConstructorSpec):
-            return spec
+            return spec  # type: ignore[return-value]  # as tyro's own rules do
         return replace(spec, fields=tuple(_shown(field) for field in spec.fields))
 
     @registry.primitive_rule
@@ -116,7 +116,8 @@ def _shown(field: StructFieldSpec) -> StructFieldSpec:
     if text is not None:
         field = replace(field, helptext=lambda: _joined(text))
     if is_optional(field.type):
-        field = replace(field, type=Annotated[field.type, tyro.conf.arg(help_behavior_hint=_default)])
+        hint: Any = Annotated[field.type, tyro.conf.arg(help_behavior_hint=_default)]
+        field = replace(field, type=hint)
     return field
 
 

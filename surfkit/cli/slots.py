@@ -28,7 +28,7 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
         if get_origin(hint) is Annotated and chosen_recipe in get_args(hint):
             known = recipes(argv)
             found["recipe"] = tuple(known)
-            if (chosen := known.get(chosen_name(argv))) is not None:
+            if (chosen := known.get(chosen_name(argv) or "")) is not None:
                 found |= open_places(chosen, argv) | _below(type(chosen), chosen, "")
         elif get_origin(hint) is Annotated and chosen_table in get_args(hint):
             found["table"] = tuple(tables(argv))
@@ -72,7 +72,7 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
 
 def handled(argv: Sequence[str]) -> set[str]:
     """The words that have changed the chosen recipe already."""
-    recipe = recipes([word for word in argv if word.startswith("recipe:")]).get(chosen_name(argv))
+    recipe = recipes([word for word in argv if word.startswith("recipe:")]).get(chosen_name(argv) or "")
     return set() if recipe is None else with_parts(recipe, argv)[1]
 
 

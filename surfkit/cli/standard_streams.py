@@ -9,7 +9,10 @@ import select
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 READER_LEFT = 141
 """What a shell reports for a program that SIGPIPE ends, and so what a command returns whose output nobody reads."""
@@ -78,14 +81,13 @@ def outlive_terminal() -> None:
             continue
         if not isinstance(getattr(stream.buffer, "raw", None), _Terminal):
             file = io.BufferedWriter(_Terminal(stream.fileno(), "wb", closefd=False))
-            settings = {"encoding": stream.encoding, "errors": stream.errors, "line_buffering": True}
-            setattr(sys, name, io.TextIOWrapper(file, **settings))
+            setattr(sys, name, io.TextIOWrapper(file, stream.encoding, stream.errors, line_buffering=True))
 
 
 class _Terminal(io.FileIO):
     """Writes to a terminal, and to nobody when it is gone."""
 
-    def write(self, content: bytes) -> int | None:
+    def write(self, content: ReadableBuffer, /) -> int:
         """As FileIO does."""
         try:
             return super().write(content)
@@ -120,7 +122,7 @@ def _has_no_reader(number: int) -> bool:
     return any(state & (select.POLLERR | select.POLLHUP) for _, state in watch.poll(0))
 
 
-def _is_refused(stream: io.TextIOBase, number: int) -> bool:
+def _is_refused(stream: TextIO, number: int) -> bool:
     """Whether what is still in the buffer, or nothing at all, cannot be written."""
     try:
         stream.flush()

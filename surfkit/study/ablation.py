@@ -105,9 +105,10 @@ def offered_tables() -> dict[str, Table]:
 
 def build(table: Table) -> dict[str, Recipe]:
     """The recipe of every row, by label."""
-    recipes, below = {}, built_on(table)
+    recipes: dict[str, Recipe] = {}
+    below = built_on(table)
     for row in table.rows:
-        recipes[row.label] = with_changes(table, row, recipes.get(below[row.label], table.base))
+        recipes[row.label] = with_changes(table, row, recipes.get(below[row.label] or "", table.base))
     return recipes
 
 

@@ -55,8 +55,8 @@ def notes_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
                 rows = into.setdefault(text, [])
                 rows += [] if trial.label in rows else [trial.label]
     if len(devices) > 1:  # the table went on elsewhere
-        for where, rows in devices.items():
-            found[f"trained on {where}: minutes and FPS compare with such rows only"] = rows
+        for device, rows in devices.items():
+            found[f"trained on {device}: minutes and FPS compare with such rows only"] = rows
     return [{"text": text, "rows": rows} for text, rows in found.items()]
 
 
@@ -74,7 +74,7 @@ def row_numbers(chosen: Collection[str], labels: Sequence[str]) -> str:
         return f"row {at[0]}"
     firsts = [number for number in at if number - 1 not in at]
     lasts = [number for number in at if number + 1 not in at]
-    parts = []
+    parts: list[str] = []
     for first, last in zip(firsts, lasts, strict=True):
         parts += [f"{first} to {last}"] if last - first > 1 else map(str, range(first, last + 1))
     return f"rows {' and '.join(filter(None, [', '.join(parts[:-1]), parts[-1]]))}"

@@ -9,7 +9,7 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.evaluate.images.lpips import MIN_SIDE_PX, NoWeights, load_perceptual
+from surfkit.evaluate.images.lpips import MIN_SIDE_PX, Net, NoWeights, load_perceptual
 from surfkit.evaluate.images.measure_images import lpips_names, lpips_values
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.raster.select import Device
@@ -19,7 +19,7 @@ from surfkit.runs.pipeline import loaded, opened
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import View
 
-NET = "alex"
+NET: Net = "alex"
 """The network of CityGaussianV2's released code; it is a tenth of the work of the other."""
 
 
@@ -53,7 +53,7 @@ def measure_lpips(folder: Path, device: Device) -> dict[str, Any]:
         for at, view in enumerate(views):
             mask = None if masks is None else masks[at]
             if mask is None or mask.any():
-                color = (made.draw_color or made.draw)(view).color.clamp(0, 1)
+                color = (made.draw_color or made.draw)(view).need("color").clamp(0, 1)
                 mask = None if mask is None else mask.to(color.device)
                 found[view.name] = lpips_values([network], color, view_photo(view).to(color) / 255, mask)
         images |= {name: statistics.fmean(one[name] for one in found.values()) for name in lpips_names([network])}

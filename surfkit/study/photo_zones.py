@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -55,7 +56,7 @@ class Zones:
     def __post_init__(self) -> None:
         if wrong := [number for number in self.seen if number < 1]:
             raise BadInput(f"--seen {wrong[0]}: it is a number of training views, so give 1 or more")
-        if self.seams not in (None, "auto") and not 0 < self.seams < float("inf"):
+        if self.seams is not None and self.seams != "auto" and not 0 < self.seams < float("inf"):
             raise BadInput(f"--seams {self.seams:g}: it is a length, so it must be above 0, or auto")
 
     def refuse_too_many(self, scene: Scene) -> None:
@@ -146,15 +147,8 @@ def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: DepthSource, s
     zones.refuse_too_many(scene)
     wanted = tuple(sorted(set(zones.seen)))
 
-    def near(sight: ViewCounts) -> Tensor:
-        flat = sight.places.reshape(-1, 3)
-        known = torch.isfinite(flat[:, 0])
-        found = torch.zeros(len(flat), dtype=torch.bool)
-        found[known] = torch.from_numpy(seams.near(flat[known].numpy()))
-        return found.reshape(sight.counts.shape)
-
     def parts(sight: ViewCounts) -> dict[str, Tensor]:
-        return by_views(wanted)(sight) | ({} if seams is None else by_seams(near)(sight))
+        return by_views(wanted)(sight) | ({} if seams is None else by_seams(partial(_near, seams))(sight))
 
     found = measure_parts(
         count_views(scene.held_out, scene.train if wanted else (), depths),
@@ -171,3 +165,12 @@ def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: DepthSource, s
         named = {name: found[name] for name in ("near", "elsewhere") if name in found}
         result["seams"] = {"depth": depths.source, "distance": seams.distance, **named}
     return result
+
+
+def _near(seams: Seams, sight: ViewCounts) -> Tensor:
+    """(H, W) bool: pixels whose places are near a border; those without a place are not."""
+    flat = sight.places.reshape(-1, 3)
+    known = torch.isfinite(flat[:, 0])
+    found = torch.zeros(len(flat), dtype=torch.bool)
+    found[known] = torch.from_numpy(seams.near(flat[known].numpy()))
+    return found.reshape(sight.counts.shape)

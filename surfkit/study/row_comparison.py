@@ -88,7 +88,7 @@ def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list
         measured: Numbers of each finished run, by label and seed.
     """
     below, rows = built_on(table), {row.label: row for row in table.rows}
-    return [compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
+    return [compared(at, row, rows.get(below[row.label] or ""), measured) for at, row in enumerate(table.rows, 1)]
 
 
 def compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:

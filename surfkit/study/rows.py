@@ -9,11 +9,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json, write_text
@@ -146,7 +146,7 @@ def await_worker(folder: Path) -> None:
         time.sleep(CHILD_POLL_S)
 
 
-def run_elsewhere(works: Sequence[TrialJob], workers: Executor) -> Iterator[tuple[TrialJob, TrialResult]]:
+def run_elsewhere(works: Sequence[TrialJob], workers: Executor) -> Generator[tuple[TrialJob, TrialResult], None, None]:
     """Each of some rows with its outcome, in the order in which they end.
 
     Raises:
@@ -154,7 +154,8 @@ def run_elsewhere(works: Sequence[TrialJob], workers: Executor) -> Iterator[tupl
     """
     share = CacheSettings().bytes() // (workers.at_once or 1)
     works = [work if workers.at_once is None else replace(work, cache=str(share)) for work in works]
-    with closing(workers.run([job_of(at, work) for at, work in enumerate(works)])) as results:
+    jobs = [job_of(at, work) for at, work in enumerate(works)]
+    with closing(cast(Generator[JobResult, None, None], workers.run(jobs))) as results:  # see `Executor.run`
         for result in results:
             work = works[result.job.index]
             yield work, outcome_of(work, result)

@@ -196,7 +196,7 @@ class Session:
                     self.save()
                     self.watch.end(work.trial, outcome, self.report)
         for mesh in plan.meshes:
-            ((data, truth),) = plan.sets
+            (data,), (truth,) = plan.data, plan.truth
             self.outcomes[mesh.folder(truth, plan.out)] = measured_mesh(mesh, truth, data, plan.out)
             self.save()
         return self.report

@@ -93,7 +93,8 @@ def _from_json(path: Path) -> Table:
     if not entry.rows:
         raise BadInput(f"{path}: rows: there are none; give at least one")
     try:
-        base, rows = _recipe(entry.base, "base"), []
+        base = _recipe(entry.base, "base")
+        rows: list[Row] = []
         recipes: dict[str, Recipe] = {}
         for at, one in enumerate(entry.rows):
             plain = Row(one.label, {}, one.kept, one.paper, None, one.on, one.group)

@@ -246,7 +246,7 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
         number, label, on, seeds = names_of_row(report, at)
         label = f"> {label}" if row["label"] == running else label
         stacked = below[at] if len(entries) == 1 else [FormattedNumber()] * len(names)
-        cells = [_stacked(cell, *pair, style) for group in own for cell, *pair in zip(group[at], stacked, strict=True)]
+        cells = [_stacked(*pair, style) for group in own for pair in zip(group[at], stacked, strict=True)]
         extra = [Text(_two_lines(cell), "dim") for cell in (below[at] if beside else ())]
         table.add_row(number, Text(printable(label), style), on, seeds, *cells, *extra)
     return table

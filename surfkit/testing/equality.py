@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.registry import Component
 
+C = TypeVar("C", bound=Component)
 PLAIN_TYPES = (bool, int, float, str, bytes, type(None), Path)
 
 
@@ -56,6 +58,11 @@ def assert_same(what: str, first: Any, second: Any, remedy: str) -> None:
         raise AssertionError(f"{what} is not repeatable: {type(first).__name__}, then {type(second).__name__}")
     if (path := difference(first, second)) is not None:
         raise AssertionError(f"{what} is not repeatable{f': {path} differs' if path else ''}; {remedy}")
+
+
+def twin(part: C) -> C:
+    """Another instance of the same settings, as in a run that is resumed."""
+    return replace(part)  # type: ignore[type-var]  # all components are dataclasses, `Component` itself is none
 
 
 @contextmanager

@@ -92,8 +92,8 @@ def check_feature_matcher(matcher: FeatureMatcher, descriptors: str = "sift") ->
             most = len(features[side].keypoints)
             assert (matches[:, at] < most).all(), f"{name}: a match is with feature {matches[:, at].max()} of {most}"
             assert len(np.unique(matches[:, at])) == len(matches), f"{name}: a feature is in two matches of a pair"
-    for one, two in zip(found, again, strict=True):
-        assert_same(f"{name}.match", one, two, DETERMINISM_HINT)
+    for first, second in zip(found, again, strict=True):
+        assert_same(f"{name}.match", first, second, DETERMINISM_HINT)
 
 
 def _photograph() -> torch.Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.io.splats.base import SNIFFED_BYTES, Format
-from surfkit.io.splats.splat_table import SplatTable, Tile
+from surfkit.io.splats.splat_table import Kind, SplatTable, Tile
 from surfkit.scene.scene import Frame
 from surfkit.testing.equality import refuses, unchanged
 
@@ -33,14 +33,15 @@ def check_format(form: Format, count: int = 300) -> None:
     name = type(form).__name__
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        for kind in ("gaussian", "surfel"):
+        kinds: tuple[Kind, ...] = ("gaussian", "surfel")
+        for kind in kinds:
             for number, degree in ((0, 0), (1, 1), (count, 3)):
                 _check_model(form, folder, splat_table(kind, number, degree), f"{name}, {number} splats ({kind})")
         _check_refusals(name, form, folder, splat_table("gaussian", count, 1))
         _check_survey(name, form, folder, splat_table("gaussian", count, 0))
 
 
-def splat_table(kind: str = "gaussian", count: int = 300, degree: int = 1) -> SplatTable:
+def splat_table(kind: Kind = "gaussian", count: int = 300, degree: int = 1) -> SplatTable:
     """Random splats within a few units of 0, with colours and scales that every format has a place for."""
     draw = torch.Generator().manual_seed(count + degree)
     return SplatTable(

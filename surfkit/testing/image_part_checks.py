@@ -21,7 +21,7 @@ from surfkit.losses.base import Loss, Regularizer, RegularizerInput
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
-from surfkit.testing.equality import assert_same, unchanged
+from surfkit.testing.equality import assert_same, twin, unchanged
 from surfkit.testing.inputs import cloud, depth_input, maps, splats, target
 from surfkit.testing.synthetic import Synthetic
 
@@ -42,6 +42,7 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
     draw = torch.Generator().manual_seed(0)
     given = target(size, draw)
     cases = [("", torch.rand(size, generator=draw), given), (" of an empty render", torch.zeros(size), given)]
+    assert given.prior is not None, "`target` has one"
     without = {
         " without a depth prior": replace(given, prior=None),
         " without prior normals": replace(given, prior=replace(given.prior, normal=None)),
@@ -91,7 +92,8 @@ def check_regularizer(regularizer: Regularizer, given: Splats | None = None) -> 
 
 def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Tensor) -> None:
     """A term in some steps, and again with the columns that it has kept in between."""
-    draw, size, columns = torch.Generator().manual_seed(0), (24, 32), {}
+    draw, size = torch.Generator().manual_seed(0), (24, 32)
+    columns: dict[str, Tensor] = {}
     about, alpha = target(size, draw), torch.rand(size, generator=draw)
     drawn = maps(alpha if seen.any() else torch.zeros(size), {"color", "alpha", *regularizer.reads}, draw)
     step = RegularizerInput(1_000, 30_000, about, drawn, seen, _stats(columns, len(given)))
@@ -101,7 +103,7 @@ def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Ten
             value = regularizer.in_step(given, step)
         assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
         assert torch.isfinite(value), f"{name} is {value.item()}"
-        resumed = replace(regularizer).in_step(given, replace(step, stat=_stats(kept, len(given))))
+        resumed = twin(regularizer).in_step(given, replace(step, stat=_stats(kept, len(given))))
         assert torch.equal(value, resumed), f"{name}: a resumed run differs; draw from `target.seed`, keep in `stat`"
         _check_gradients(name, value, {key: each for key, each in given.named().items() if each.requires_grad})
 

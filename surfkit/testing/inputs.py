@@ -174,7 +174,7 @@ def exact_depths(synthetic: Synthetic) -> tuple[Depths, list[Maps]]:
     drawn = [
         Maps(e.color.float(), (e.depth > 0).float(), e.depth.float(), e.depth.float(), e.normal.float()) for e in exact
     ]
-    return Depths([view.camera for view in synthetic.scene.train], lambda at: drawn[at].depth.clone()), drawn
+    return Depths([view.camera for view in synthetic.scene.train], lambda at: drawn[at].need("depth").clone()), drawn
 
 
 def above(x: float, y: float, height: float = 0.5) -> Camera:
@@ -195,7 +195,7 @@ def coarse_model(count: int = 1_500, seed: int = 0) -> CoarseModel:
     quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous()
     discs = Splats("surfel", means, quats, torch.full((count, 2), 0.025), torch.full((count,), 0.9), color)
     at = [(-0.8 + 1.6 * i / 5, -0.8 + 1.6 * j / 4) for j in range(5) for i in range(6)]
-    views = tuple(View(f"{i:02}.png", above(*xy), path=None) for i, xy in enumerate(at))
+    views = tuple(View(f"{i:02}.png", above(*xy), Path(f"{i:02}.png")) for i, xy in enumerate(at))
     return CoarseModel(discs, views, select("cpu")[0], 0.01, observations=_shown(means, views))
 
 
@@ -240,18 +240,19 @@ def mesh_input(kind: str = "surfel", count: int = 900, views: int = 14, **change
     sh = torch.tensor([1.0, -1.0, -1.0]).expand(count, 1, 3).contiguous() / 0.2821 / 2
     ball = Splats(kind, (BALL_RADIUS * normals).float(), _facing(normals), scales, torch.full((count,), 0.95), sh)
     rasterizer, _ = select("cpu")
-    seen = tuple(View(f"{i}", _towards_origin(2.0 * at), path=None) for i, at in enumerate(_evenly(views)))
+    seen = tuple(View(f"{i}", _towards_origin(2.0 * at), Path(f"{i}")) for i, at in enumerate(_evenly(views)))
 
     def draw_of(splats: Splats) -> Callable[[View], Maps]:
         return lambda view: rasterizer.render(splats, view.camera, 0.01, True, False).maps
 
     draw = draw_of(ball)
     drawn = [draw(view) for view in seen]
-    inverses = [torch.where(m.median > 0, 1 / m.median.clamp_min(1e-9), 0.0) for m in drawn]
+    medians = [m.need("median") for m in drawn]
+    inverses = [torch.where(depth > 0, 1 / depth.clamp_min(1e-9), 0.0) for depth in medians]
     priors = [DepthPrior(i, (i > 0).float(), 1.0, m.normal) for i, m in zip(inverses, drawn, strict=True)]
-    photos = [(m.color.clamp(0, 1) * 255).round().to(torch.uint8) for m in drawn]
+    photos = [(m.need("color").clamp(0, 1) * 255).round().to(torch.uint8) for m in drawn]
     given = MeshInput(ball, seen, draw, rasterizer, 0.01, Frame(np.zeros(3), 1.0), 1 << 30)
-    known = {"priors": priors, "photo": photos.__getitem__, "draw_of": draw_of}
+    known: dict[str, Any] = {"priors": priors, "photo": photos.__getitem__, "draw_of": draw_of}
     return replace(given, **(known | changes))
 
 

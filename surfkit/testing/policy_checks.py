@@ -15,7 +15,7 @@ from torch import Tensor
 from surfkit.densify.base import Densify, Filter, Policy, Prune, Signal, Step
 from surfkit.primitives.edit import Edit, NewPoints
 from surfkit.primitives.points import Points
-from surfkit.testing.equality import assert_same, unchanged
+from surfkit.testing.equality import assert_same, twin, unchanged
 from surfkit.testing.inputs import crowd, splats
 
 STAGE_STEPS = 30_000
@@ -94,7 +94,7 @@ def check_filter(filter: Filter) -> None:
                 mask = filter.admits(about, want)
             assert mask.dtype == torch.bool, f"{name}.admits{what} gives {mask.dtype}, not bool"
             assert mask.shape == (count,), f"{name}.admits{what} has shape {tuple(mask.shape)}, not ({count},)"
-            again = replace(filter).admits(about, want)
+            again = twin(filter).admits(about, want)
             assert_same(f"{name}.admits{what}", mask, again, "draw from a generator with `step.seed`")
 
 
@@ -121,7 +121,7 @@ def check_signal(signal: Signal) -> None:
         assert found.shape == (60, 2), f"{name}.combine{what} has shape {tuple(found.shape)}, not (60, 2)"
         assert torch.isfinite(found).all(), f"{name}.combine{what} is not finite"
         assert not (found * (1 - seen)).any(), f"{name}.combine{what} is not 0 for points that are not seen"
-        assert_same(f"{name}.combine{what}", found, replace(signal).combine(a, b), "it may depend on its inputs only")
+        assert_same(f"{name}.combine{what}", found, twin(signal).combine(a, b), "it may depend on its inputs only")
 
 
 def _taken_through(policy: Policy, given: tuple[Points, Step] | None = None) -> Iterator[tuple[int, Edit | None]]:
@@ -160,7 +160,7 @@ def _edit(policy: Policy, points: Points, step: Step) -> Edit | None:
         policy.watch(points, step)
         stats = {key: value.clone() for key, value in points.stats.items()}
         first = policy.edit(points, step)
-        second = replace(policy).edit(points, step)  # another instance, as in a run that is resumed
+        second = twin(policy).edit(points, step)
         for key, value in points.params.items():
             assert torch.equal(value, before[key]), f"{name} changed the parameter {key!r}; return an Edit instead"
     for key, value in points.stats.items():

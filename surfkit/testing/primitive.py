@@ -158,7 +158,7 @@ def _check_render(name: str, primitive: Primitive, splats: Splats) -> None:
         raise AssertionError(str(error)) from error
     for field, value in (("seen", render.seen), ("radii", render.radii)):
         assert value.shape == (len(splats),), f"{name}: {field} has shape {tuple(value.shape)}, not ({len(splats)},)"
-    cotangent = Maps(color=torch.ones_like(render.maps.color))
+    cotangent = Maps(color=torch.ones_like(render.maps.need("color")))
     for key, value in render.backward(cotangent, cotangent).named().items():
         shape = splats.named()[key].shape
         assert value.shape == shape, f"{name}: the gradient of {key!r} has shape {tuple(value.shape)}, not {shape}"

@@ -225,6 +225,7 @@ def _check_poses(name: str, found: RawDataset, truth: Synthetic) -> None:
 def _check_cloud(name: str, cloud: SparsePoints) -> None:
     count = len(cloud.xyz)
     assert count, f"{name} gives no point"
+    fields: dict[str, tuple[torch.dtype, tuple[int, ...]]]
     fields = {"xyz": (torch.float32, (count, 3)), "rgb": (torch.uint8, (count, 3))}
     fields |= {"normals": (torch.float32, (count, 3))} if cloud.normals is not None else {}
     fields |= {key: (torch.float32, (count,)) for key in ("opacity", "size") if getattr(cloud, key) is not None}

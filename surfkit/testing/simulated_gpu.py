@@ -198,7 +198,7 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
         return loaded[source, device]
 
     gpu = SimulatedGpu()
-    memory = {
+    memory: dict[str, Any] = {
         "max_memory_allocated": lambda device=None: gpu.peak,
         "reset_peak_memory_stats": lambda device=None: gpu.reset_peak(),
         "mem_get_info": lambda device=None: (gpu.free(), gpu.free() + gpu.held),
@@ -262,8 +262,8 @@ class OnSimulatedGpu(Rasterizer):
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
-        found = self.inner.contribution(_here(splats), camera, near, alpha_power, transmittance_power)
-        return tuple(each.to(splats.means.device) for each in found)
+        total, count = self.inner.contribution(_here(splats), camera, near, alpha_power, transmittance_power)
+        return total.to(splats.means.device), count.to(splats.means.device)
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         return self.inner.opacity_before(_here(splats), camera, near, points.cpu()).to(points.device)
@@ -275,16 +275,21 @@ class _SimulatedRender(Render):
         self.seen, self.radii = inner.seen.to(self._there), inner.radii.to(self._there)
 
     @cached_property
-    def maps(self) -> Maps:
+    def maps(self) -> Maps:  # type: ignore[override]  # drawn when it is asked for
         return Maps(**{name: value.to(self._there) for name, value in self._inner.maps.present().items()})
 
     def backward(
         self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
     ) -> Gradients:
-        here = [m and Maps(**{name: value.cpu() for name, value in m.present().items()}) for m in (total, chosen)]
-        found = self._inner.backward(*here, absolute, rows)
-        moved = {name: value.to(self._there) for name, value in vars(found).items() if isinstance(value, Tensor)}
+        found = self._inner.backward(_maps_here(total), chosen and _maps_here(chosen), absolute, rows)
+        moved: dict[str, Any] = {
+            name: value.to(self._there) for name, value in vars(found).items() if isinstance(value, Tensor)
+        }
         return replace(found, **moved)
+
+
+def _maps_here(maps: Maps) -> Maps:
+    return Maps(**{name: value.cpu() for name, value in maps.present().items()})
 
 
 def _here(splats: Splats) -> Splats:

@@ -58,25 +58,25 @@ def check_trust(trust: Trust) -> None:
     """
     name, truth = type(trust).__name__, survey()
     depths, drawn = exact_depths(truth)
-    prior = exact_priors(truth)[4]
+    prior, depth = exact_priors(truth)[4], drawn[4].need("depth")
     for what, given in {
         "": prior,
         " without a prior": None,
         " without prior normals": replace(prior, normal=None),
     }.items():
         with unchanged(f"{name}.within", maps=drawn[4], prior=given):
-            weight = trust.within(drawn[4], drawn[4].depth, given)
-        _check_weights(f"{name}.within{what}", weight, drawn[4].depth)
-        assert_same(f"{name}.within{what}", weight, trust.within(drawn[4], drawn[4].depth, given), "draw nothing")
-        kept = float((weight > 0)[drawn[4].depth > 0].float().mean())
+            weight = trust.within(drawn[4], depth, given)
+        _check_weights(f"{name}.within{what}", weight, depth)
+        assert_same(f"{name}.within{what}", weight, trust.within(drawn[4], depth, given), "draw nothing")
+        kept = float((weight > 0)[depth > 0].float().mean())
         assert kept > 0.5, f"{name}.within{what} leaves out {1 - kept:.0%} of the pixels of a true depth map"
     weight = trust.among(4, depths)
-    _check_weights(f"{name}.among", weight, drawn[4].depth)
+    _check_weights(f"{name}.among", weight, depth)
     assert_same(f"{name}.among", weight, trust.among(4, depths), "draw nothing")
-    kept = float((weight > 0)[drawn[4].depth > 0].float().mean())
+    kept = float((weight > 0)[depth > 0].float().mean())
     assert kept > 0.5, f"{name}.among leaves out {1 - kept:.0%} of the pixels of true depth maps"
-    nothing = Depths(depths.cameras, lambda at: torch.zeros_like(drawn[at].depth))
-    _check_weights(f"{name}.among, where no view has a depth,", trust.among(4, nothing), drawn[4].depth)
+    nothing = Depths(depths.cameras, lambda at: torch.zeros_like(drawn[at].need("depth")))
+    _check_weights(f"{name}.among, where no view has a depth,", trust.among(4, nothing), depth)
 
 
 def _check_weights(what: str, weight: Tensor, depth: Tensor) -> None:
@@ -88,6 +88,7 @@ def _check_weights(what: str, weight: Tensor, depth: Tensor) -> None:
 def _check_whole(name: str, mesh: Mesh) -> None:
     """Types and shapes, rows that are there, finite places and facts that can be saved."""
     vertices, faces, colors = mesh.vertices, mesh.faces, mesh.colors
+    wanted: list[tuple[str, np.ndarray, type[np.generic], int]]
     wanted = [("vertices", vertices, np.float32, 3), ("faces", faces, np.int32, 3)]
     wanted += [("colors", colors, np.uint8, 3)] if colors is not None else []
     for what, array, dtype, width in wanted:

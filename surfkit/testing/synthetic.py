@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -246,7 +246,7 @@ def _observed(xyz: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[i
     return [(int(point), np.array([x[point], y[point]])) for point in seen]
 
 
-def _row(values: Sequence[float]) -> str:
+def _row(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 

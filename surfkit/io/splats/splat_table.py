@@ -29,6 +29,10 @@ SPLAT_COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_re
 """Tensors of a table, a row for each splat."""
 
 
+Kind = Literal["surfel", "gaussian"]
+"""A flat disc (2DGS) or an ellipsoid (3DGS)."""
+
+
 @dataclass(frozen=True)
 class SplatTable:
     """N splats in raw values, as files hold them.
@@ -45,7 +49,7 @@ class SplatTable:
         axes: Of the numbers in the file that the splats were read from; the reader has turned them to PLY_AXES.
     """
 
-    kind: Literal["surfel", "gaussian"]
+    kind: Kind
     means: Tensor
     quats: Tensor
     log_scales: Tensor

@@ -224,7 +224,7 @@ GRADIENT_TABLE = Table(
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
 WITHOUT_NORMALS = {name: loss for name, loss in surface.SURFACE.pretrain.losses.items() if name != "normal"}
-WITH_SKY = replace(surface.SURFACE.mesh, sky=True)
+WITH_SKY = replace(surface.SURFACE_MESH, sky=True)
 PIXEL_MAPS = replace(WITH_SKY, oversampling=1.0)
 PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
 CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=GeometricConsistency(alone=0.1))

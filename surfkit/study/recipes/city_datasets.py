@@ -87,8 +87,9 @@ RELEASED_SIGNAL = LossGradient(terms=("ssim", "normal", "depth"))
 
 def released_depth(recipe: Recipe, end: float) -> dict[str, Loss]:
     """The losses of the blocks of a recipe, with the structural similarity of inverse depths down to a weight `end`."""
-    depth = replace(recipe.tune.losses["depth"], start=0.5, end=end, error="ssim")
-    return recipe.tune.losses | {"depth": depth}
+    depth = recipe.tune.losses["depth"]
+    assert isinstance(depth, DepthRegression)
+    return recipe.tune.losses | {"depth": replace(depth, start=0.5, end=end, error="ssim")}
 
 
 # docs/paper.md says in what else the released code differs, and why that is left out.

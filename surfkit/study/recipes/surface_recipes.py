@@ -27,14 +27,32 @@ from surfkit.train.stage import Stage
 SURFACE_RATES = {name: replace(rate, start=2 * rate.start, end=rate.start) for name, rate in columns.RATES.items()}
 SURFACE_RATES["means"] = LearningRate(0.8e-4, 0.8e-6)
 
+# In alleys, where no depth is trusted, training keeps right points that it has and finds few by itself.
+SURFACE_START = StereoStart(closing=0.5)
+
+# Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
+# Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
+# ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
+# than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys
+# apart; so do depth maps of 1.5 times the size. The sky, which photographs from the ground show, is no surface.
+SURFACE_TRUST = GeometricConsistency(alone=0.5, covered_by=2)
+SURFACE_MESH = TSDF(
+    voxel_px=0.8,
+    truncation_voxels=1.75,
+    oversampling=1.5,
+    least_views=0.05,
+    largest_px=64.0,
+    sky=False,
+    trust=SURFACE_TRUST,
+)
+
 SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
     test_every=0,
     # Harmonics of degree 2 take a tenth more time in training, with the same F1 and 0.1 dB more.
     primitive=Surfel2D(sh_degree=1),
     depth=PatchMatch(),
-    # In alleys, where no depth is trusted, training keeps right points that it has and finds few by itself.
-    start=StereoStart(closing=0.5),
+    start=SURFACE_START,
     pretrain=Stage(
         losses={
             "l1": L1(),
@@ -52,26 +70,13 @@ SURFACE = Recipe(
         rates=SURFACE_RATES,
         update="in-view",
     ),
-    # Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
-    # Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
-    # ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
-    # than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys
-    # apart; so do depth maps of 1.5 times the size. The sky, which photographs from the ground show, is no surface.
-    mesh=TSDF(
-        voxel_px=0.8,
-        truncation_voxels=1.75,
-        oversampling=1.5,
-        least_views=0.05,
-        largest_px=64.0,
-        sky=False,
-        trust=GeometricConsistency(alone=0.5, covered_by=2),
-    ),
+    mesh=SURFACE_MESH,
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where
 # nobody would seem to look, and no discs at the rim: the mesh does not end there. Its maps have their own pixels alone.
 STEREO_FUSION = replace(
-    SURFACE.mesh, largest_px=0.0, oversampling=1.0, sky=True, trust=replace(SURFACE.mesh.trust, covered_by=0)
+    SURFACE_MESH, largest_px=0.0, oversampling=1.0, sky=True, trust=replace(SURFACE_TRUST, covered_by=0)
 )
 STEREO = Recipe(
     about="Stereo depth maps alone, fused as recipe:surface fuses but for rims: no splats, the baseline of any surface",
@@ -94,6 +99,6 @@ SURFACE_SHORT = replace(
     SURFACE,
     about="A first look at the surface, for runs of some hundred steps: stereo at half the size, fewer points",
     depth=PatchMatch(scale=2, passes=3, rounds=1),
-    start=replace(SURFACE.start, spacing_px=5.0),
-    mesh=replace(SURFACE.mesh, voxel_px=1.2, oversampling=1.0),
+    start=replace(SURFACE_START, spacing_px=5.0),
+    mesh=replace(SURFACE_MESH, voxel_px=1.2, oversampling=1.0),
 )
