@@ -126,7 +126,7 @@ def read_glb(path: Path) -> GltfDocument:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-    raw = memoryview(data)
+    raw = data.data
     if bytes(raw[:4]) != GLB_MAGIC:
         raise BadInput(f"{path}: no GLB file: it does not begin with 'glTF'; a .gltf must be made a .glb first")
     if len(raw) < 20:

@@ -11,7 +11,9 @@ from models import data_set
 from pages import ROOT, code
 
 import surfkit
+from surfkit.api.results import RunMesh
 from surfkit.cli import main
+from surfkit.io.splats.ply import write_points
 
 TINY = {"SCENE": "scene", "scale=4": "scale=1", "steps=100": "steps=12", "triangles=50_000": "triangles=500"}
 """What is smaller here than on the page."""
@@ -139,6 +141,12 @@ def test_a_mesh_that_the_method_made_takes_no_mesher(page, folder, monkeypatch):
     for given in ({"mesher": "tsdf"}, {"voxel_px": 2.0}):
         with pytest.raises(surfkit.BadInput, match="made its mesh itself"):
             run.mesh(**given)
+
+
+def test_a_cloud_is_no_mesh(tmp_path):
+    write_points(tmp_path / "cloud.ply", np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8))
+    with pytest.raises(surfkit.BadInput, match=r"cloud.ply: a cloud of points; name a mesh"):
+        RunMesh.read(tmp_path / "cloud.ply")
 
 
 def test_train_is_a_function_and_a_folder():

@@ -307,8 +307,9 @@ def _axes(where: str, group: ElementTree.Element) -> np.ndarray:
 
 def _pose(where: str, photo: ElementTree.Element, axes: np.ndarray) -> np.ndarray:
     """(4, 4) world_to_camera, x right, y down, z forward."""
-    rotation = photo.find("Pose/Rotation")
-    centre = np.array(_texts(f"{where}: Center", photo.find("Pose/Center"), "xyz"))
+    rotation, place = photo.find("Pose/Rotation"), photo.find("Pose/Center")
+    assert rotation is not None and place is not None, "`_photos` has left out those without"
+    centre = np.array(_texts(f"{where}: Center", place, "xyz"))
     if rotation.find("M_00") is not None:
         turn = np.array(_texts(f"{where}: Rotation", rotation, MATRIX)).reshape(3, 3)
     elif rotation.find("Omega") is not None:

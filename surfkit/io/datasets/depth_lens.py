@@ -94,12 +94,12 @@ def judge(data: Data, scene: Scene, maps: Mapping[str, DepthFile], tracks: Obser
     chosen = views[:: max(1, -(-len(views) // COMPARED_MAPS))]
     with ThreadPoolExecutor(4) as pool:
         votes = list(pool.map(lambda view: _votes(view, maps[view.name], tracks, scene), chosen))
-    undistorted, of_distorted = np.sum(votes, axis=0, dtype=np.int64) if votes else (0, 0)
+    undistorted, of_distorted = (sum(vote[side] for vote in votes) for side in (0, 1))
     count = undistorted + of_distorted
     most = max(undistorted, of_distorted)
     if most < MIN_FIT_SHARE * count or abs(undistorted - of_distorted) <= MIN_MAJORITY_SIGMAS * np.sqrt(count):
         return Verdict()
-    return Verdict(bool(undistorted > of_distorted), "points")
+    return Verdict(undistorted > of_distorted, "points")
 
 
 def _votes(view: View, file: DepthFile, tracks: Observations, scene: Scene) -> tuple[int, int]:
@@ -107,7 +107,7 @@ def _votes(view: View, file: DepthFile, tracks: Observations, scene: Scene) -> t
     one does; each time scaled to fit as well as it can, as its unit is another question."""
     try:
         values = file.read()
-        if not fits_both(view, file, values.shape):
+        if view.lens is None or not fits_both(view, file, values.shape):
             return 0, 0
         at, inverse, _ = points_in(view, tracks, scene, guess=file.aligned)
         bent = distorted(at, view.lens)

@@ -215,7 +215,7 @@ def alignment(
     fits = [answer if isinstance(answer, ScaleOffsetFit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
     unfit = dict.fromkeys(_outliers(fits, band), "its scale is far from that of the other images")
-    for at, reason in (unfit | in_other_units([fit and fit.unit for fit in fits])).items():
+    for at, reason in (unfit | in_other_units([None if fit is None else fit.unit for fit in fits])).items():
         reasons[scene.train[at].name] = reason
         fits[at] = None
     if not any(fits):
@@ -227,7 +227,7 @@ def alignment(
     used = [fit for fit in fits if fit is not None]
     if text := verdict.line(sum(fit.lens is not None for fit in used), sum(fit.either for fit in used)):
         emit(Warned(text))
-    if text := far_warning([fit and fit.unit for fit in fits], scene):
+    if text := far_warning([fit.unit for fit in used], scene):
         emit(Warned(text))
     if text := trust_warning(float(np.mean([fit.trusted for fit in used]))):
         emit(Warned(text))

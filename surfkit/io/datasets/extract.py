@@ -82,9 +82,8 @@ def save(path: Path, made: Extract) -> None:
     )
     facts = ExtractHeader(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, made.priors)
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.train])
-    arrays = {"facts": np.array(json.dumps(dump(facts))), "poses": poses, "origin": frame.origin}
     with replacing(path) as file:
-        np.savez(file, **arrays)
+        np.savez(file, facts=np.array(json.dumps(dump(facts))), poses=poses, origin=frame.origin)
 
 
 def is_whole(path: Path) -> bool:

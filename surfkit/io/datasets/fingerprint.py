@@ -203,8 +203,10 @@ def _stamp(
 ) -> FileStamp:
     try:
         state = path.stat()
-        same = before is not None and (before.size, before.time_ns) == (state.st_size, state.st_mtime_ns)
-        content = before.content if same else _content(path, state.st_size, whole)
+        if before is not None and (before.size, before.time_ns) == (state.st_size, state.st_mtime_ns):
+            content = before.content
+        else:
+            content = _content(path, state.st_size, whole)
     except OSError:
         return FileStamp(-1, 0, "", meaning)
     return FileStamp(state.st_size, state.st_mtime_ns, content, meaning)

@@ -157,7 +157,10 @@ def warn_of_bend(where: str, name: str, move: Similarity, metres: float, convert
 
 def _ellipsoid(where: str, flat: CRS) -> tuple[float, float]:
     """Its semi-major axis, metres, and flattening."""
-    axis, inverse = flat.ellipsoid.semi_major_metre, flat.ellipsoid.inverse_flattening
+    ellipsoid = flat.ellipsoid
+    if ellipsoid is None:
+        raise BadInput(f"{where}: {flat.name!r} has no ellipsoid; choose another system, and export again")
+    axis, inverse = ellipsoid.semi_major_metre, ellipsoid.inverse_flattening
     if not (6e6 < axis < 7e6 and (inverse == 0 or 100 < inverse < 1000)):
         raise BadInput(
             f"{where}: {flat.name!r} has an ellipsoid of {axis:g} m and a flattening of 1 : {inverse:g}, which is not "
@@ -174,8 +177,10 @@ def _projection(where: str, text: str, flat: CRS, at: np.ndarray) -> tuple[str, 
         if abs(at[0]) > MAX_UTM_LATITUDE:
             raise BadInput(f"{where}: degrees at latitude {at[0]:.1f}, where UTM ends; choose a projected system")
         zone = (int((at[1] + 180) // 6) % 60 + 1, bool(at[0] < 0))
-    utm_crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}" if zone is not None else None
-    if utm_crs and (flat.is_projected or code in WGS84):
+    if zone is None:
+        return _by_pyproj(where, text, code, None)
+    utm_crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}"
+    if flat.is_projected or code in WGS84:
         return utm_crs, 1.0, lambda lat, lon: np.array([utm(*pair, *zone) for pair in zip(lat, lon, strict=True)])
     return _by_pyproj(where, text, code, utm_crs)
 
@@ -186,7 +191,9 @@ def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tup
         given = CRS(code or text)
         given = given.sub_crs_list[0] if given.is_compound else given
         target = (CRS(onto) if onto else given).to_2d()
-        degrees = given.geodetic_crs.to_2d()
+        if (geodetic_crs := given.geodetic_crs) is None:
+            raise ProjError("it has no geodetic system")
+        degrees = geodetic_crs.to_2d()
         if (known := exact(degrees, target)) is None:
             emit(Warned(f"{where}: the shift from its datum to {onto} is not known; places may be some 100 m off"))
             known = Transformer.from_crs(degrees, target, always_xy=True)

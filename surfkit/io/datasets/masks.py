@@ -197,7 +197,8 @@ class _Emptied:
     """Says of masks, once all have been read, which keep nothing of their photographs: they are decoded once."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        self._views, self._empty, self._lock = views, [], threading.Lock()
+        self._views, self._lock = views, threading.Lock()
+        self._empty: list[int] = []
         self._left = {at for at, view in enumerate(views) if view.mask is not None and not view.mask.is_part}
 
     def note(self, at: int, keeps: bool) -> None:

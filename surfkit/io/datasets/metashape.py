@@ -56,10 +56,10 @@ class Metashape(Reader):
             with leaving_out():
                 where = f"{path}: sensor {number}"
                 sensor = sensors.get(number)
-                is_whole = sensor is not None and sensor.get("type") == SPHERICAL
-                known[number] = (
-                    panorama(where, _size(where, sensor)) if is_whole else lenses.camera(where, _lens(where, sensor))
-                )
+                if sensor is not None and sensor.get("type") == SPHERICAL:
+                    known[number] = panorama(where, _size(where, sensor))
+                else:
+                    known[number] = lenses.camera(where, _lens(where, sensor))
         lenses.tell()
         shots = []
         for camera, name in zip(cameras, names, strict=True):
@@ -151,8 +151,7 @@ def _pose(where: str, camera: ElementTree.Element) -> np.ndarray:
 
 def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
     """The lens of a sensor: as adjusted, or as it was given."""
-    given = [] if sensor is None else sensor.findall("calibration")
-    if not given:
+    if sensor is None or not (given := sensor.findall("calibration")):
         raise BadInput(f"{where}: no calibration of it; align the photographs, and export the cameras again")
     best = next((one for one in given if one.get("class") == "adjusted"), given[0])
     kind = best.get("type") or sensor.get("type", "")

@@ -149,7 +149,7 @@ class _SfmData:
             pixels = np.array([sight[2:] for sight in sights], np.float64).reshape(-1, 2) + FIRST_PIXEL_CENTRE
         except DAMAGE_ERRORS as error:
             raise _damaged(self.path, error) from error
-        good = (np.abs(xyz) < MAX_CAMERA_NUMBER).all(1)
+        good = np.all(np.abs(xyz) < MAX_CAMERA_NUMBER, axis=1)
         kept = np.where(good, np.cumsum(good) - 1, -1)
         rows = np.array([sight[0] for sight in sights], np.int64)
         listed: dict[str, list[int]] = {}

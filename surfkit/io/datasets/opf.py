@@ -9,7 +9,7 @@ that of Pix4D's other files, as OpenCV has it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -200,9 +200,10 @@ def _entries(path: Path, contents: Mapping[str, Any], name: str) -> list[Mapping
     return listed
 
 
-def _inputs(path: Path, project: Mapping[str, Any]) -> tuple[dict[Any, Sequence[Any]], list[Any]]:
+def _inputs(path: Path, project: Mapping[str, Any]) -> tuple[dict[Any, Any], list[Any]]:
     """The sizes of the photographs of each sensor, and the numbers of all cameras that took one."""
-    sizes, taken = {}, []
+    sizes: dict[Any, Any] = {}
+    taken: list[Any] = []
     for contents, file in _all(path, project, "input-cameras"):
         sizes |= {each.get("id"): each.get("image_size_px") for each in _entries(file, contents, "sensors")}
         for capture in _entries(file, contents, "captures"):
@@ -225,10 +226,10 @@ def _pose(where: str, camera: Mapping[str, Any], shift: np.ndarray) -> np.ndarra
     return pose_at(where, OPENGL_TO_OPENCV @ (about_x @ about_y @ about_z).T, position + shift)
 
 
-def _lens(where: str, sensor: Mapping[str, Any], sizes: Mapping[Any, Sequence[Any]]) -> Brown:
-    inner = sensor.get("internals")
-    kind = inner.get("type") if isinstance(inner, dict) else None
-    if kind != "perspective":
+def _lens(where: str, sensor: Mapping[str, Any], sizes: Mapping[Any, Any]) -> Brown:
+    found = sensor.get("internals")
+    inner: Any = found if isinstance(found, dict) else {}
+    if (kind := inner.get("type")) != "perspective":
         raise BadInput(f"{where}: of type {shorten(kind)}; only perspective is read: use undistorted photographs")
     if sensor.get("id") not in sizes:
         raise BadInput(f"{where}: the input cameras do not have it, and so not the size of its photographs")

@@ -88,10 +88,10 @@ class _Camera:
         where, k = f"{path}: {self.name}", self.matrix
         if any(k[(1, 2, 2), (0, 0, 1)]) or k[2, 2] != 1:
             raise BadInput(f"{where}: the camera matrix has entries below its diagonal; export the parameters again")
-        radial = (*(float(value) for value in self.radial), 0.0)
+        k1, k2, k3 = (float(value) for value in self.radial)
         tangential = (float(self.tangential[0]), float(self.tangential[1]))
         focal, centre = (float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2]))
-        return Brown(self.size, focal, centre, radial, tangential, shear=float(k[0, 1]))
+        return Brown(self.size, focal, centre, (k1, k2, k3, 0.0), tangential, shear=float(k[0, 1]))
 
 
 def _files(root: Path) -> list[Path]:

@@ -130,8 +130,8 @@ def _alphas(
     """What becomes of transparent pixels by name, of photographs that may have some; and what to say."""
     said = []
     if dropped := [name for name, kind in kinds.items() if kind.dropped > 0]:
-        bands = f"bands beyond red, green and blue of {_photographs(len(dropped))}, {few(dropped)}"
-        said.append(f"{bands}, are no opacity by their tag, and are not used")
+        beyond = f"bands beyond red, green and blue of {_photographs(len(dropped))}, {few(dropped)}"
+        said.append(f"{beyond}, are no opacity by their tag, and are not used")
     having = [name for name, kind in kinds.items() if kind.opacity]
     if alpha is not None:
         if not having:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -106,7 +107,7 @@ def build_scene(
     data: Data,
     capture: RawDataset,
     keep: Path | None = None,
-    only: Collection[str] | None = None,
+    only: Set[str] | None = None,
     pixels: bool = True,
 ) -> Scene:
     """The scene of a capture.
@@ -121,7 +122,7 @@ def build_scene(
             is written.
     """
     held_out = data.held_out(capture)
-    shots = sorted(capture.shots, key=lambda shot: shot.name)
+    shots: Sequence[RawImage] = sorted(capture.shots, key=lambda shot: shot.name)
     if twice := next((a for a, b in pairwise(sorted(view_names(shots))) if a == b), None):
         reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
@@ -181,8 +182,7 @@ def _frame(data: Data, capture: RawDataset, poses: np.ndarray) -> Frame:
 def _metres(stated: float | None, crs: str | None, frame: Frame) -> float | None:
     """Metres per unit as they were stated, or as the coordinate reference system has them; a line tells of both where
     they contradict each other."""
-    axes = known_axes(crs) if crs else None
-    if axes is None:
+    if crs is None or (axes := known_axes(crs)) is None:
         return stated
     try:
         refuse_other_unit(crs, stated, frame.origin)
@@ -377,7 +377,7 @@ def _view(shot: RawImage, picture: DistortedPhoto, bent: Lens | None, frame: Fra
     return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white, bent, picture.pixels)
 
 
-def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
+def _shares(pixels: np.ndarray, lens: Any, camera: Camera) -> np.ndarray:
     """(K, 2) pixels of a lens as shares of the width and height of the undistorted picture."""
     if is_pinhole(lens):
         return pixels / (lens.width, lens.height)

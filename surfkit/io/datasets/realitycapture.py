@@ -76,7 +76,7 @@ def _columns(line: str) -> list[str]:
     return [NEWER_COLUMNS.get(word, word) for word in words]
 
 
-def _rows(path: Path) -> list[Mapping[str, str]]:
+def _rows(path: Path) -> list[dict[str, str]]:
     """The photographs: text by column."""
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     columns = _columns(lines[0])

@@ -52,7 +52,8 @@ class Record3D(Reader):
                 f"{path}: perFrameIntrinsicCoeffs is no list of a lens for each of {len(poses)} poses; export again"
             )
         names = [f"{PHOTOS_FOLDER}/{at}.jpg" for at in range(len(poses))]
-        found, shots, known = photographs(data, names, PHOTOS_FOLDER), [], {}
+        found, shots = photographs(data, names, PHOTOS_FOLDER), []
+        known: dict[str, Any] = {}
         width, height = (round(side) for side in numbers(f"{path}: w, h", [values["w"], values["h"]], 2).tolist())
         k = numbers(f"{path}: K", values["K"], 9).reshape(3, 3).T
         for at, name in enumerate(names):

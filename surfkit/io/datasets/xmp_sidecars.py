@@ -95,7 +95,7 @@ def _values(path: Path) -> dict[str, str]:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise BadInput(f"{path}: not XML: {error}; export the XMP files again") from error
-    found = {}
+    found: dict[str, str] = {}
     for element in root.iter():
         pairs = [*element.attrib.items(), (str(element.tag), element.text or "")]
         found |= {name.rpartition("}")[2]: value.strip() for name, value in pairs if name.startswith(f"{{{SPACE}")}

@@ -89,7 +89,7 @@ class CompressedPLY(Format):
 
         colors = _unpacked(words["packed_color"], COLOR_BITS)
         opacities = colors[:, 3]
-        colors = within("packed_color", COLOR_BITS, ("r", "g", "b")) if "min_r" in bounds.dtype.names else colors[:, :3]
+        colors = within("packed_color", COLOR_BITS, ("r", "g", "b")) if _has_color_bounds(bounds) else colors[:, :3]
         three = _unpacked(words["packed_rotation"], ROTATION_BITS) * 2 - 1
         table = SplatTable(
             kind="gaussian",
@@ -175,25 +175,22 @@ def _unpacked(words: np.ndarray, bits: tuple[tuple[int, int], ...]) -> np.ndarra
 
 def _checked(path: Path, elements: Elements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Bounds, words and (N, K - 1, 3) float32 coefficients of the elements of a file."""
-    bounds, words = elements.get("chunk"), elements.get("vertex")
-    needed = [("chunk", bounds, BOUNDS[:12], "f"), ("vertex", words, PACKED_COLUMNS, "u")]
-    for name, rows, properties, kind in needed:
-        names = rows.dtype.names if rows is not None else ()
-        wrong = [p for p in properties if p not in names or rows.dtype[p].kind != kind]
-        if wrong:
+    bounds, words = (elements.get(name, np.empty(0)) for name in ("chunk", "vertex"))
+    for name, rows, properties, kind in (("chunk", bounds, BOUNDS[:12], "f"), ("vertex", words, PACKED_COLUMNS, "u")):
+        if wrong := [p for p in properties if p not in _names(rows) or rows.dtype[p].kind != kind]:
             raise BadInput(f"{path}: no compressed PLY file: element {name} lacks {wrong[0]}, or it is of another type")
     if len(bounds) < -(-len(words) // CHUNK_SPLATS):
         raise BadInput(
             f"{path}: {len(bounds)} chunks of {CHUNK_SPLATS} splats cannot hold {len(words)}; write the file again"
         )
-    if "min_r" in bounds.dtype.names and not set(BOUNDS) <= set(bounds.dtype.names):
+    if _has_color_bounds(bounds) and not set(BOUNDS) <= set(_names(bounds)):
         raise BadInput(f"{path}: the bounds of colours are not whole; write the file again")
     coefficients = elements.get("sh")
     if coefficients is None:
         return bounds, words, np.zeros((len(words), 0, 3), np.float32)
-    rest = len(coefficients.dtype)
+    rest = len(_names(coefficients))
     ordered = [f"f_rest_{i}" for i in range(rest)]
-    if rest not in (9, 24, 45) or {*ordered} != {*coefficients.dtype.names} or len(coefficients) != len(words):
+    if rest not in (9, 24, 45) or {*ordered} != {*_names(coefficients)} or len(coefficients) != len(words):
         there = f"{len(coefficients)} rows of {rest}"
         raise BadInput(f"{path}: element sh has {there}; there must be {len(words)} of 9, 24 or 45")
     if any(coefficients.dtype[name] != np.uint8 for name in ordered):
@@ -202,6 +199,15 @@ def _checked(path: Path, elements: Elements) -> tuple[np.ndarray, np.ndarray, np
     inner = (values.astype(np.float32) + 0.5) / 32 - 4
     exact = np.where(values == 0, np.float32(-4), np.where(values == 255, np.float32(4), inner))
     return bounds, words, np.ascontiguousarray(exact.reshape(len(words), 3, rest // 3).transpose(0, 2, 1))
+
+
+def _has_color_bounds(bounds: np.ndarray) -> bool:
+    return "min_r" in _names(bounds)
+
+
+def _names(rows: np.ndarray) -> tuple[str, ...]:
+    """The properties of an element; none of one that is not there."""
+    return rows.dtype.names or ()
 
 
 def _header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: list[str]) -> bytes:

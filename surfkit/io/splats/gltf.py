@@ -12,6 +12,7 @@ coefficients of degree 0. We write files as Cesium does, and read both.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -153,15 +154,18 @@ def _plain(path: Path, blocks: GlbWriter, table: SplatTable) -> dict[str, Any]:
     }
     for name, at in harmonics(table.sh_degree):
         columns[name] = ("VEC3", lambda at=at: table.sh_rest[:, at].numpy())
-    view = blocks.add(12 * count, lambda: _bytes(means.numpy()), target=VERTICES)
+
+    def add(width: int, make: Callable[[], np.ndarray]) -> int:
+        return blocks.add(4 * width * count, lambda: _bytes(make()), target=VERTICES)
+
+    view = add(3, means.numpy)
     attributes = {"POSITION": blocks.accessor(view, componentType=FLOAT, count=count, type="VEC3", min=low, max=high)}
     view = blocks.add(4 * count, lambda: _fallback(table), target=VERTICES)
     attributes["COLOR_0"] = blocks.accessor(
         view, componentType=UNSIGNED_BYTE, count=count, type="VEC4", normalized=True
     )
     for name, (kind, make) in columns.items():
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[kind]
-        view = blocks.add(4 * width * count, lambda make=make: _bytes(make()), target=VERTICES)
+        view = add({"SCALAR": 1, "VEC3": 3, "VEC4": 4}[kind], make)
         attributes[f"{SPLATS}:{name}"] = blocks.accessor(view, componentType=FLOAT, count=count, type=kind)
     about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "extensions": {SPLATS: {**about, "projection": "perspective"}}}

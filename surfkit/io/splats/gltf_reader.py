@@ -122,7 +122,7 @@ def _meshes(document: GltfDocument) -> Iterator[tuple[np.ndarray, dict[str, Any]
             yield matrix, mesh
 
 
-def _list(document: GltfDocument, holder: dict[str, Any], key: str) -> list[Any]:
+def _list(document: GltfDocument, holder: Mapping[str, Any], key: str) -> list[Any]:
     found = holder.get(key, [])
     if not isinstance(found, list):
         raise document.fault(f"damaged: {key} is no list")
@@ -212,9 +212,9 @@ def _joined(tables: list[SplatTable], degree: int) -> SplatTable:
     """All splats in one table, with the harmonics of the highest degree; one without splats has `degree`."""
     if not tables:
         zeros = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3}
-        columns = {name: torch.zeros(0, width) for name, width in zeros.items()}
+        empty: dict[str, Any] = {name: torch.zeros(0, width) for name, width in zeros.items()}
         rest = torch.zeros(0, (degree + 1) ** 2 - 1, 3)
-        return SplatTable(kind="gaussian", opacity_logits=torch.zeros(0), sh_rest=rest, **columns)
+        return SplatTable(kind="gaussian", opacity_logits=torch.zeros(0), sh_rest=rest, **empty)
     if len(tables) == 1:
         return tables[0]
     most = max(table.sh_rest.shape[1] for table in tables)
@@ -222,6 +222,5 @@ def _joined(tables: list[SplatTable], degree: int) -> SplatTable:
         replace(table, sh_rest=torch.nn.functional.pad(table.sh_rest, (0, 0, 0, most - table.sh_rest.shape[1])))
         for table in tables
     ]
-    wide = any(table.means.dtype == torch.float64 for table in padded)
-    columns = {name: torch.cat([getattr(table, name) for table in padded]) for name in SPLAT_COLUMNS}
-    return replace(padded[0], **columns, **({"means": columns["means"].double()} if wide else {}))
+    columns: dict[str, Any] = {name: torch.cat([getattr(table, name) for table in padded]) for name in SPLAT_COLUMNS}
+    return replace(padded[0], **columns)

@@ -16,7 +16,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from PIL import Image
@@ -184,6 +184,6 @@ def _opaque(pixels: np.ndarray) -> np.ndarray:
 
 def _webp(pixels: np.ndarray, effort: int) -> bytes:
     """A lossless image; colours of transparent pixels are kept too."""
-    file: BinaryIO = io.BytesIO()
+    file = io.BytesIO()
     Image.fromarray(pixels, "RGBA").save(file, "WEBP", lossless=True, exact=True, quality=effort, method=4)
     return file.getvalue()

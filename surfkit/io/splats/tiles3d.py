@@ -189,9 +189,8 @@ def _halved(tile: Tile, most: int) -> Iterator[Tile]:
     order = means[:, axis].argsort(stable=True)
     for rows in order.tensor_split(2):
         splats = tile.splats.take(rows.sort().values)
-        yield from _halved(
-            replace(tile, splats=splats, **dict(zip(("low", "high"), _corners(splats), strict=True))), most
-        )
+        low, high = _corners(splats)
+        yield from _halved(replace(tile, splats=splats, low=low, high=high), most)
 
 
 def _corners(table: SplatTable) -> tuple[np.ndarray, np.ndarray]:

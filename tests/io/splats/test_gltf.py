@@ -242,6 +242,18 @@ def test_files_of_other_programs_are_read_with_their_nodes(tmp_path):
     np.testing.assert_allclose(found.sh_rest, torch.stack([x, z, -y], 1), atol=1e-6)
 
 
+def test_splats_of_several_nodes_are_read_with_their_places(tmp_path):
+    table = splat_table(count=20, degree=1)
+    document, data = foreign(table, translation=[1, 2, 3])
+    document["meshes"] *= 2
+    document["nodes"].append({"mesh": 1})
+    document["scenes"][0]["nodes"].append(2)
+    found = read_splats(glb(tmp_path / "a.glb", document, data))
+    moved = 2 * table.means.double() + torch.tensor([2, 4, 6])
+    torch.testing.assert_close(found.means, torch.cat([moved, table.means]))
+    torch.testing.assert_close(found.sh_rest, table.sh_rest.repeat(2, 1, 1))
+
+
 @pytest.mark.parametrize("third", [0.0, 1e-9, 0.5])
 def test_flat_splats_of_other_programs_are_surfels(tmp_path, third):
     table = splat_table(count=20, degree=0)
