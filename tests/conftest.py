@@ -189,7 +189,7 @@ def world(bare, monkeypatch):
     bare.plugins().register(Plugin(), "stand-in")
     for name, values in {
         "surfkit.apps.train": {"COMMAND": Train},
-        "surfkit.runs.recipe": {"Recipe": Recipe, "complete": lambda recipe, _: recipe},
+        "surfkit.runs.recipe": {"Recipe": Recipe} | dict.fromkeys(("complete", "with_steps"), lambda recipe, _: recipe),
     }.items():
         module = types.ModuleType(name)
         vars(module).update(values)

@@ -60,7 +60,7 @@ class FilmTool:
             self.size = gui.add_dropdown("size", FILM_SIZES)
             self.show = gui.add_dropdown("of", get_args(Show))
             self.button = gui.add_button("make the video")
-            self.bar: Any = gui.add_progress_bar(0.0, visible=False)  # as in `set_value`
+            self.bar: Any = gui.add_progress_bar(0.0, visible=False)  # its value is read-only for mypy, see `set_value`
             self.told = gui.add_markdown("", visible=False)
         self.button.on_click(telling(client, lambda _: self._clicked()))
 

@@ -88,10 +88,10 @@ class Live:
         if self.around is not None:
             page.enter(self.around)
         self.pages[client.client_id] = page
+        self.wake.set()
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         self.pages.pop(client.client_id, None)
-        self.wake.set()
 
     def _draw_pictures(self) -> None:
         """Order one picture after the other, and rest after each so that the share is kept."""
