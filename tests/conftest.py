@@ -187,9 +187,10 @@ def world(bare, monkeypatch):
     """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and its recipes."""
     importlib.import_module("surfkit.cli.parse")  # which would import the modules that are replaced below
     bare.plugins().register(Plugin(), "stand-in")
+    functions = ("complete", "with_steps", "refuse_unused", "unused", "without_unused")
     for name, values in {
         "surfkit.apps.train": {"COMMAND": Train},
-        "surfkit.runs.recipe": {"Recipe": Recipe} | dict.fromkeys(("complete", "with_steps"), lambda recipe, _: recipe),
+        "surfkit.runs.recipe": {"Recipe": Recipe} | dict.fromkeys(functions, lambda recipe, *_: recipe),
     }.items():
         module = types.ModuleType(name)
         vars(module).update(values)
