@@ -8,13 +8,14 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.reference import Reference
 from surfkit.scene.camera import Camera
 from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import splats
 
 NEAR_PLANE = 0.01
+BOX_SPLATS = 4
 MAX_VALUE_ERROR = 1e-3
 """Largest error of a value, as a share of the largest one of its map if that is above 1."""
 MAX_ODD_SHARE = 0.02
@@ -25,7 +26,8 @@ MAX_GRADIENT_ERROR = 0.02
 
 def check_rasterizer(rasterizer: Rasterizer) -> None:
     """A rasterizer draws what the reference draws, of discs and ellipsoids, with its gradients, contributions and
-    opacities; it repeats itself, changes nothing it was given, draws no splats as black, and refuses NaN.
+    opacities; it tells what is in view, repeats itself, changes nothing it was given, draws no splats as black, and
+    refuses NaN.
 
     Args:
         rasterizer: To check.
@@ -50,9 +52,22 @@ def check_rasterizer(rasterizer: Rasterizer) -> None:
         for what, one, two in (("render", found.maps, again.maps), ("backward", grads, again.backward(total))):
             assert_same(f"{name}.{what}", one, two, "sum in a fixed order")
         _check_measures(f"{name} of {kind}s", rasterizer, reference, given)
+        _check_in_view(f"{name} of {kind}s", rasterizer, given, found)
         _check_refusal(name, rasterizer, given)
         color = rasterizer.render(given.first(0), camera, NEAR_PLANE).maps.color
         assert not torch.as_tensor(color).any(), f"{name} draws something where there are no {kind}s"
+
+
+def _check_in_view(name: str, rasterizer: Rasterizer, given: Splats, drawn: Render) -> None:
+    """What is drawn is in view, and what is in view is in a box in view: else steps would leave points out."""
+    in_view = torch.as_tensor(rasterizer.in_view(given, _camera(), NEAR_PLANE)).cpu()
+    lost = int((drawn.seen.cpu() & ~in_view).sum())
+    assert not lost, f"{name}: {lost} splats that are drawn are not in `in_view`"
+    shown = rasterizer.boxes_in_view(SplatBoxes.of(given, BOX_SPLATS), _camera(), NEAR_PLANE)
+    if shown is not None:
+        of_boxes = torch.as_tensor(shown).cpu().repeat_interleave(BOX_SPLATS)[: len(given)]
+        lost = int((in_view & ~of_boxes).sum())
+        assert not lost, f"{name}: {lost} splats of `in_view` are in boxes that are not in `boxes_in_view`"
 
 
 def _camera() -> Camera:

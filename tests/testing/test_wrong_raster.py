@@ -77,6 +77,16 @@ class Blind(Own):
         return view(render, seen=nobody, radii=render.radii * nobody, backward=render.backward)
 
 
+class Narrow(Own):
+    def in_view(self, splats, camera, near):
+        return super().in_view(splats, camera, near) & (torch.arange(len(splats)) > 5)
+
+
+class Closed(Own):
+    def boxes_in_view(self, boxes, camera, near):
+        return torch.arange(len(boxes)) > 0
+
+
 @pytest.mark.parametrize(
     ("rasterizer", "message"),
     [
@@ -86,6 +96,8 @@ class Blind(Own):
         (Noisy(), "Noisy.render is not repeatable: color"),
         (Lenient(), "Lenient draws .*NaN"),
         (Counts(), r"Counts of surfels: .*contribution: \d+%"),
+        (Narrow(), r"Narrow of surfels: \d+ .*`in_view`"),
+        (Closed(), r"Closed of surfels: 4 .*`boxes_in_view`"),
         (Blind(), r"Blind of surfels: \d+ .*`seen`"),
     ],
 )
