@@ -2,7 +2,7 @@
 
 Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
 many points in each view whatever the number of photographs. For each survey and each way to update, a process of its
-own takes steps of 2DGS without densification, spread over all of the photographs: the median CPU time of a step, all
+own takes steps of 2DGS, without densification or, with --policies, between its edits, spread over all photographs: the median CPU time of a step, all
 threads, and the peak of the memory. Points are made at once, not read; photographs are noise, made when they are asked
 for, so that neither files nor the cache count.
 """
@@ -69,10 +69,11 @@ def survey(photographs: int) -> tuple[tuple[View, ...], SparsePoints]:
     return tuple(views), SparsePoints(xyz, rgb, size=torch.full((count,), 0.5 * 2 / math.sqrt(count)))
 
 
-def measured(photographs: int, update: str, steps: int) -> dict[str, float]:
+def measured(photographs: int, update: str, steps: int, policies: bool) -> dict[str, float]:
     """Median CPU milliseconds of a step, and the peak of this process."""
     views, cloud = survey(photographs)
-    stage = replace(SURFELS.pretrain, steps=30_000, densify=None, update=update)
+    stage = replace(SURFELS.pretrain, steps=30_000, update=update)
+    stage = stage if policies else replace(stage, densify=None, prune=())
     rasterizer, _ = select("cpu")
     trainer = Trainer(stage, SURFELS.primitive, views, Noise(photographs), rasterizer)
     generator = torch.Generator().manual_seed(0)
@@ -97,17 +98,19 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, nargs="+", default=[2000, 8000])
     parser.add_argument("--updates", nargs="+", default=["all", "in-view"])
     parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--policies", action="store_true", help="with the recipe's densification and pruning")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
-        print(json.dumps(measured(given.photographs[0], given.updates[0], given.steps)))
+        print(json.dumps(measured(given.photographs[0], given.updates[0], given.steps, given.policies)))
         return
     figures = {}
     for update in given.updates:
         for photographs in given.photographs:
             words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--updates", update]
+            words += ["--policies"] * given.policies
             said = subprocess.run([*words, "--steps", str(given.steps)], stdout=subprocess.PIPE, text=True, check=True)
-            figures[f"{update} {photographs}"] = found = json.loads(said.stdout)
+            figures[f"{update} {photographs}" + " policies" * given.policies] = found = json.loads(said.stdout)
             print(update, photographs, *(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
     print(f"wrote {save('growth', figures)}")
 

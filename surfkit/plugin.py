@@ -34,7 +34,18 @@ from surfkit.core.registry import Component, choice, components, find, name_of
 from surfkit.core.schedule import Interval, LearningRate, StepCount, Steps, log_linear, rescale
 from surfkit.core.tree import evolve
 from surfkit.densify.adc import ADC
-from surfkit.densify.base import Contribution, Densify, Filter, Policy, Prune, Signal, Step, Views, admitted
+from surfkit.densify.base import (
+    Contribution,
+    Densify,
+    Filter,
+    Policy,
+    Prune,
+    Signal,
+    Step,
+    Views,
+    ViewStatistics,
+    admitted,
+)
 from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.signal import AbsGradient
@@ -227,6 +238,7 @@ __all__ = [
     "Tracks",
     "Trust",
     "View",
+    "ViewStatistics",
     "Views",
     "Warned",
     "WarpedPatches",

@@ -11,7 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.core.schedule import StepCount, Steps
-from surfkit.densify.base import Densify, Filter, Step, admitted
+from surfkit.densify.base import Densify, Filter, Step, ViewStatistics, admitted
 from surfkit.densify.filters import CountCap
 from surfkit.primitives.base import SHRINK
 from surfkit.primitives.edit import Edit
@@ -83,7 +83,11 @@ class ADC(Densify):
             raise BadInput(f"densify.reset_opacity is {self.reset_opacity}; it must lie between 0 and 1")
 
     def watch(self, points: Points, step: Step) -> None:
-        """Sum the signal and count the views, from one edit to the next."""
+        """See `Policy.watch`."""
+        self.note(points, step, step.shown)
+
+    def note(self, points: Points, step: Step, shown: ViewStatistics) -> None:
+        """Sum the signal and count the views, from one edit to the next; `shown` may have another signal."""
         if step.index >= self.until:
             return
         names = [GRAD_STAT, SEEN_STAT] + [SIZE_STAT] * (self.cull_screen > 0) + [SIGNED_STAT] * self.needs_absolute
@@ -91,13 +95,13 @@ class ADC(Densify):
         if self.is_due(step.index - 1):
             for column in columns.values():
                 column.zero_()
-        columns[GRAD_STAT].add_(step.grad_norm)
-        columns[SEEN_STAT].add_(step.seen)
+        shown.add(columns[GRAD_STAT], shown.grad_norm)
+        shown.add(columns[SEEN_STAT], shown.seen)
         if self.cull_screen > 0:
-            torch.maximum(columns[SIZE_STAT], step.radii / step.image_px, out=columns[SIZE_STAT])
+            shown.raise_to(columns[SIZE_STAT], shown.radii / step.image_px)
         if self.needs_absolute:
-            assert step.signed_norm is not None, "a trainer gives it to policies that need it"
-            columns[SIGNED_STAT].add_(step.signed_norm)
+            assert shown.signed_norm is not None, "a trainer gives it to policies that need it"
+            shown.add(columns[SIGNED_STAT], shown.signed_norm)
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Clone, split and drop every so often; reset opacities less often."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from surfkit.core.lazy import Lazy
 from surfkit.core.registry import Component, find
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
@@ -48,8 +49,41 @@ class Views(Protocol):
 
 
 @dataclass(frozen=True)
+class ViewStatistics:
+    """What a step tells of the points that it was for: with it, statistics cost what the view shows.
+
+    Attributes:
+        rows: (R,) int64, different points; None where the step was for all N, in their order.
+        seen, grad_norm, radii, signed_norm: (R,) of these points, as in `Step`; of all others they are 0.
+    """
+
+    rows: Tensor | None
+    seen: Tensor
+    grad_norm: Tensor
+    radii: Tensor
+    signed_norm: Tensor | None = None
+
+    def add(self, column: Tensor, values: Tensor) -> None:
+        """Add (R,) values to a column (N,), in place."""
+        if self.rows is None:
+            column.add_(values)
+        else:
+            column.index_add_(0, self.rows, values.to(column.dtype))
+
+    def raise_to(self, column: Tensor, values: Tensor) -> None:
+        """Raise what is lower in a column (N,) to (R,) values, in place."""
+        if self.rows is None:
+            torch.maximum(column, values, out=column)
+        else:
+            column[self.rows] = torch.maximum(column[self.rows], values)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Step:
-    """What policies know after one optimisation step.
+    """What policies know after one optimisation step; to be read within `watch` and `edit`.
+
+    Values of all N points are made when they are first read. A policy that reads none of them in most steps, and keeps
+    its statistics by `shown`, costs what the view shows.
 
     Attributes:
         index: Steps done, this one included.
@@ -68,22 +102,29 @@ class Step:
             seen. The trainer always gives it.
         derived: What was drawn in place of the points, with its `grad_norm`, for a primitive that draws splats made of
             them (`DerivedRender`); None for others.
+        in_view: See `shown`; None where the step was for all points.
     """
 
     index: int
     steps: int
-    seen: Tensor
-    splats: Splats
-    grad_norm: Tensor
-    radii: Tensor
+    seen: Lazy[Tensor] = Lazy()
+    splats: Lazy[Splats] = Lazy()
+    grad_norm: Lazy[Tensor] = Lazy()
+    radii: Lazy[Tensor] = Lazy()
     image_px: int
     views: Views
     since_reset: int = 0
     rates: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     owns: Callable[[Tensor], Tensor] | None = None
-    signed_norm: Tensor | None = None
+    signed_norm: Lazy[Tensor | None] = Lazy(None)
     derived: Derived | None = None
+    in_view: ViewStatistics | None = None
+
+    @property
+    def shown(self) -> ViewStatistics:
+        """Of the points in view alone, where the step was for these; else of all."""
+        return self.in_view or ViewStatistics(None, self.seen, self.grad_norm, self.radii, self.signed_norm)
 
     def may_be_densified(self) -> Tensor:
         """(N,) bool, the points that stand where this block owns them now; a trainer copies and splits no others."""

@@ -41,11 +41,13 @@ class MatchedADC(Densify):
         """Sum both gradients and count the views, from one edit to the next."""
         if step.index >= self.adc.until:
             return
-        absolute = points.stat(ABSOLUTE_STAT)
+        absolute, shown = points.stat(ABSOLUTE_STAT), step.shown
+        if shown.signed_norm is None:
+            raise BadInput("densify: a step without `signed_norm`; whoever makes steps for matched-adc must give it")
         if self.adc.is_due(step.index - 1):
             absolute.zero_()
-        absolute.add_(step.grad_norm)
-        self.adc.watch(points, replace(step, grad_norm=_signed(step)))
+        shown.add(absolute, shown.grad_norm)
+        self.adc.note(points, step, replace(shown, grad_norm=shown.signed_norm))
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """As that of ADC, but with the points that both gradients choose."""
@@ -80,10 +82,3 @@ class MatchedADC(Densify):
     def limited(self, points: int) -> MatchedADC:
         """See `Densify.limited`; the points farthest above a threshold come first."""
         return replace(self, adc=self.adc.limited(points))
-
-
-def _signed(step: Step) -> Tensor:
-    """(N,) lengths of the signed gradient."""
-    if step.signed_norm is None:
-        raise BadInput("densify: a step without `signed_norm`; whoever makes steps for matched-adc must give it")
-    return step.signed_norm

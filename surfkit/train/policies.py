@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import Policy, Step
+from surfkit.densify.base import Policy, Step, ViewStatistics
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
@@ -22,28 +23,42 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     """What the policies are told about a step, and nothing about frozen points."""
     stage, index, count = setup.stage, state.index + 1, len(result.shape)
     render, gradients, in_view = result.render, result.gradients, result.in_view
-    among_all = in_view.among_all if in_view else (lambda values: values)
+    camera, points = result.target.view.camera, len(state.points)
     combined = stage.signal.combine(
         gradients.signal if gradients.chosen is None else gradients.chosen, gradients.signal
     )
-    signed_norm = among_all(lengths(gradients.signal))
-    camera = result.target.view.camera
-    drawn = result.splats if in_view is None else with_frozen(setup, state, all_splats(setup, state), 0)
+    signed_norm = lengths(gradients.signal)
+    shown = ViewStatistics(
+        rows=None if in_view is None else in_view.rows,
+        seen=render.seen[:count],
+        grad_norm=signed_norm if combined is gradients.signal else lengths(combined),
+        radii=render.radii[:count],
+        signed_norm=signed_norm,
+    )
+
+    @cache
+    def drawn() -> Splats:
+        return result.splats if in_view is None else with_frozen(setup, state, all_splats(setup, state), 0)
+
+    def of_all(name: str) -> Callable[[], Tensor]:
+        return lambda: getattr(shown, name) if in_view is None else in_view.among_all(getattr(shown, name))
+
     return Step(
         index=index,
         steps=stage.steps,
-        seen=among_all(render.seen[:count]),
-        splats=drawn.first(len(state.points)),
-        grad_norm=signed_norm if combined is gradients.signal else among_all(lengths(combined)),
-        radii=among_all(render.radii[:count]),
+        seen=of_all("seen"),
+        splats=lambda: drawn().first(points),
+        grad_norm=of_all("grad_norm"),
+        radii=of_all("radii"),
         image_px=max(camera.width, camera.height),
-        views=ViewContributions(setup.views, setup.draws, drawn, stage.near, len(state.points)),
+        views=ViewContributions(setup.views, setup.draws, drawn, stage.near, points),
         since_reset=index - state.reset_at,
         rates=rates_at(setup, state),
         seed=state.seed,
         owns=setup.owns,
-        signed_norm=signed_norm,
+        signed_norm=of_all("signed_norm"),
         derived=gradients.derived and gradients.derived.combined(stage.signal.combine),
+        in_view=None if in_view is None else shown,
     )
 
 

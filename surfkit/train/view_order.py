@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from surfkit.core.lazy import Lazy
 from surfkit.densify.base import Contribution
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.scene import View
@@ -45,8 +46,8 @@ class ViewContributions:
 
     views: Sequence[View]
     rasterizer: Rasterizer
-    shape: Splats
-    near: float
+    shape: Lazy[Splats] = Lazy()
+    near: float  # type: ignore[misc]  # the splats must be given, which mypy does not see
     rows: int | None = None
     """Of how many of the splats, the first ones, it tells; None for all."""
     tallies: dict[tuple[float, float], Contribution] = field(default_factory=dict)

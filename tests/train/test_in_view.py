@@ -15,7 +15,7 @@ from surfkit.losses.reprojection import Reprojection
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.native_rasterizer import NativeRasterizer
-from surfkit.train import checkpoint, in_view, point_blocks
+from surfkit.train import checkpoint, in_view, point_blocks, policies
 from surfkit.train.adam import UPDATED
 from surfkit.train.faults import Diverged
 from surfkit.train.in_view import PointsInView
@@ -29,12 +29,13 @@ QUIET = Stage(steps=6, densify=None, sh_every=2, update="in-view")
 
 @dataclass(frozen=True)
 class Noted(Prune):
-    """Keeps what policies are told."""
+    """Keeps what policies are told, and reads it while it is true."""
 
     steps: list = field(default_factory=list)
 
     def edit(self, points, step):
         self.steps.append(step)
+        assert len(step.seen) == len(step.splats) == len(points)
 
 
 @pytest.fixture
@@ -100,6 +101,42 @@ def test_the_first_step_is_that_of_all_points(apart):
         assert torch.equal(getattr(one.splats, name), getattr(other.splats, name)), name
     for name, value in states[0].points.params.items():
         assert torch.equal(value, states[1].points.params[name]), name
+
+
+@dataclass(frozen=True)
+class Sums(Prune):
+    """Keeps statistics in both ways: of the points in view alone, and of all."""
+
+    def watch(self, points, step):
+        step.shown.add(points.stat("view/grad"), step.shown.grad_norm)
+        step.shown.add(points.stat("view/seen"), step.shown.seen)
+        step.shown.raise_to(points.stat("view/size"), step.shown.radii)
+        points.stat("all/grad").add_(step.grad_norm)
+        points.stat("all/seen").add_(step.seen)
+        torch.maximum(points.stat("all/size"), step.radii, out=points.stat("all/size"))
+
+    def edit(self, points, step):
+        return None
+
+
+@pytest.mark.parametrize("update", ["all", "in-view"])
+def test_statistics_of_what_is_shown_are_those_of_all(apart, update):
+    trainer, state = apart(replace(QUIET, update=update, prune=(Sums(),)))
+    list(trainer.run(state))
+    stats = state.points.stats
+    for name in ("grad", "seen", "size"):
+        assert torch.equal(stats[f"view/{name}"], stats[f"all/{name}"]) and stats[f"all/{name}"].any(), name
+    assert not stats["all/seen"].eq(6).all()
+
+
+def test_adc_looks_at_no_other_point_between_edits(apart, monkeypatch):
+    """What is made of all points would cost more the larger a survey is."""
+    trainer, state = apart(replace(QUIET, densify=ADC(), prune=(Trim(),)))
+    trainer.step(state)  # trim looks at all once
+    monkeypatch.setattr(policies, "all_splats", None)
+    monkeypatch.setattr(PointsInView, "among_all", None)
+    trainer.step(state)
+    assert state.points.stats["adc/seen"].max() == 2
 
 
 @pytest.mark.parametrize("change", [

@@ -283,7 +283,10 @@ def grown_case(levels=1):
     derived = Derived(made.detached(), owner, torch.ones(4, dtype=torch.bool), torch.zeros(4, 2))
     derived = derived.combined(lambda chosen, total: total)
     both = torch.ones(2, dtype=torch.bool)
-    step = Step(10, 100, both, anchors, torch.zeros(2), torch.ones(2), 24, KnownViews(torch.ones(2)), derived=derived)
+    step = Step(
+        index=10, steps=100, seen=both, splats=anchors, grad_norm=torch.zeros(2), radii=torch.ones(2), image_px=24,
+        views=KnownViews(torch.ones(2)), derived=derived,
+    )  # fmt: skip
     return growth, points, step
 
 

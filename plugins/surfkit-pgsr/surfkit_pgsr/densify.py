@@ -55,15 +55,16 @@ class TwoThresholdADC(Densify):
         """Sum both gradients, count the views and keep the largest radius, from one edit to the next."""
         if step.index >= self.adc.until:
             return
-        if step.signed_norm is None:
+        shown = step.shown
+        if shown.signed_norm is None:
             raise BadInput("densify: a step without `signed_norm`; whoever makes steps for two-threshold-adc gives it")
         absolute, radius = points.stat(ABSOLUTE), points.stat(RADIUS)
         if self.adc.is_due(step.index - 1):
             absolute.zero_()
             radius.zero_()
-        absolute.add_(step.grad_norm)
-        torch.maximum(radius, step.radii, out=radius)
-        self.adc.watch(points, replace(step, grad_norm=step.signed_norm))
+        shown.add(absolute, shown.grad_norm)
+        shown.raise_to(radius, shown.radii)
+        self.adc.note(points, step, replace(shown, grad_norm=shown.signed_norm))
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """As that of ADC, with more splits, and none beyond the number of points."""

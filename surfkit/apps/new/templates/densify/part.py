@@ -43,8 +43,8 @@ class NewPart(Densify):
         if step.index - 1 in self.edits(step.steps):
             for name in (SUM, COUNT):
                 points.stat(name).zero_()
-        points.stat(SUM).add_(step.grad_norm)
-        points.stat(COUNT).add_(step.seen)
+        step.shown.add(points.stat(SUM), step.shown.grad_norm)
+        step.shown.add(points.stat(COUNT), step.shown.seen)
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Copy the points, every so many steps."""
