@@ -17,6 +17,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
 VALUES_PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
+ROWS_COPIED = 2**17
+"""Rows of gradients that are copied together, where they do not follow each other in memory."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
 
@@ -58,6 +60,11 @@ def adam_step(
 
 def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int) -> None:
     """Take one step of Adam on a tensor (N, ...) and its moments of the same shape, in place."""
+    if not grad.is_contiguous():  # a copy of some rows at a time holds less than one of all
+        for at in range(0, len(grad), ROWS_COPIED):
+            some = slice(at, at + ROWS_COPIED)
+            update(value[some], grad[some].contiguous(), exp_avg[some], exp_avg_sq[some], rate, index)
+        return
     tensors = (value, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
         launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index)
@@ -93,6 +100,7 @@ def update_rows(
         rate: The learning rate.
         index: From 1.
     """
+    grad = grad.contiguous()
     tensors = (value, kept, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
         launch_update_rows(

@@ -21,8 +21,7 @@ from surfkit.train.view_order import ViewContributions
 
 def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     """What the policies are told about a step, and nothing about frozen points."""
-    stage, index, count = setup.stage, state.index + 1, len(result.shape)
-    render, gradients, in_view = result.render, result.gradients, result.in_view
+    stage, index, gradients, in_view = setup.stage, state.index + 1, result.gradients, result.in_view
     camera, points = result.target.view.camera, len(state.points)
     combined = stage.signal.combine(
         gradients.signal if gradients.chosen is None else gradients.chosen, gradients.signal
@@ -30,9 +29,9 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     signed_norm = lengths(gradients.signal)
     shown = ViewStatistics(
         rows=None if in_view is None else in_view.rows,
-        seen=render.seen[:count],
+        seen=result.seen,
         grad_norm=signed_norm if combined is gradients.signal else lengths(combined),
-        radii=render.radii[:count],
+        radii=result.radii,
         signed_norm=signed_norm,
     )
 

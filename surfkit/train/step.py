@@ -50,8 +50,10 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
 
     # Backward: from the maps to the splats; the gradient that drives densification comes beside that of all losses.
-    gradients = render.backward(total, chosen, stage.signal.absolute, len(shape))
-    return StepResult(target, in_view, leaves, shape, splats, render, losses, gradients, appearance)
+    count = len(shape)
+    gradients = render.backward(total, chosen, stage.signal.absolute, count)
+    drawn = render.maps, render.seen[:count], render.radii[:count]
+    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance)
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
@@ -60,8 +62,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     state.whole = False  # until the step is done
 
     # Update: terms on the points join the gradients on their way to the raw parameters, which Adam then changes.
-    seen = result.render.seen[: len(result.shape)]
-    given = index, stage.steps, result.target, result.render.maps, seen, state.points.stat, result.leaves
+    given = index, stage.steps, result.target, result.maps, result.seen, state.points.stat, result.leaves
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)

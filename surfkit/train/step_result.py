@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Splats
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView
 
@@ -21,7 +23,8 @@ class StepResult:
         leaves: Raw parameters of these points, or of all, that gradients can be taken by.
         shape: The splats made of them.
         splats: The same, detached, and the frozen ones.
-        render: The view as drawn.
+        maps: The view as drawn; what the way back needed of the drawing is not kept.
+        seen, radii: As in `Render`, of these points.
         losses: Weighted value of each loss.
         gradients: By the splats.
         appearance: That of the photograph, with its gradient, if the stage learns any.
@@ -32,7 +35,9 @@ class StepResult:
     leaves: Columns
     shape: Splats
     splats: Splats
-    render: Render
+    maps: Maps
+    seen: Tensor
+    radii: Tensor
     losses: dict[str, float]
     gradients: Gradients
     appearance: ImageAppearance | None

@@ -81,4 +81,4 @@ class Trainer(StageSetup):
         if edit is not None:
             retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
         state.index, state.whole = index, True
-        return CompletedStep(index, result.losses, len(state.points), result.render.maps, result.target)
+        return CompletedStep(index, result.losses, len(state.points), result.maps, result.target)
