@@ -17,8 +17,9 @@ class Points:
 
     Attributes:
         params: Trainable raw values, each (N, ...).
-        exp_avg: Adam's running mean of the gradient of each parameter, also of the shared ones; same shapes.
-        exp_avg_sq: Adam's running mean of the squared gradient; same shapes.
+        exp_avg: Adam's running mean of the gradient of each parameter, also of the shared ones; same shapes, float32 or
+            bfloat16.
+        exp_avg_sq: Adam's running mean of the squared gradient; as `exp_avg`.
         stats: What policies accumulate between edits, each (N, ...).
         shared: Trainable values that belong to no point, of any shape.
     """
@@ -30,9 +31,12 @@ class Points:
     shared: Columns = field(default_factory=dict)
 
     @classmethod
-    def fresh(cls, params: Columns, shared: Iterable[str] = ()) -> Points:
-        """Points that have not been optimised yet; `shared` names the parameters that belong to no point."""
-        first, second = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+    def fresh(cls, params: Columns, shared: Iterable[str] = (), moments: torch.dtype = torch.float32) -> Points:
+        """Points that have not been optimised yet, with moments of a type; `shared` names the parameters that belong to
+        no point."""
+        first, second = (
+            {name: torch.zeros_like(value, dtype=moments) for name, value in params.items()} for _ in range(2)
+        )
         common = {name: params[name] for name in shared}
         own = {name: value for name, value in params.items() if name not in common}
         return cls(own, first, second, shared=common)

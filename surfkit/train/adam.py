@@ -12,13 +12,14 @@ from surfkit.primitives.points import Columns, Points
 from surfkit.raster import native
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.train.moments import SHORT, dithered, is_short
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
 VALUES_PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
-ROWS_COPIED = 2**17
-"""Rows of gradients that are copied together, where they do not follow each other in memory."""
+ROWS_TOGETHER = 2**17
+"""Rows that are copied together where the kernels cannot take the tensors as they are."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
 
@@ -58,20 +59,41 @@ def adam_step(
     updated[rows] = index
 
 
-def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int) -> None:
-    """Take one step of Adam on a tensor (N, ...) and its moments of the same shape, in place."""
-    if not grad.is_contiguous():  # a copy of some rows at a time holds less than one of all
-        for at in range(0, len(grad), ROWS_COPIED):
-            some = slice(at, at + ROWS_COPIED)
-            update(value[some], grad[some].contiguous(), exp_avg[some], exp_avg_sq[some], rate, index)
-        return
+def update(
+    value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int, first: int = 0
+) -> None:
+    """Take one step of Adam on a tensor (N, ...) and its moments of the same shape, in place.
+
+    Args:
+        value: (N, ...).
+        grad: (N, ...).
+        exp_avg: (N, ...), float32 or, as `exp_avg_sq`, bfloat16 (`train.moments`).
+        exp_avg_sq: (N, ...).
+        rate: The learning rate.
+        index: The step, from 1.
+        first: Place in its column of the first value, for moments in 16 bits.
+    """
     tensors = (value, grad, exp_avg, exp_avg_sq)
     if all(_is_gpu(t) for t in tensors):
-        launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index)
+        launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index, first)
+        return
+    if len(grad) > ROWS_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
+        width = grad[0].numel()  # copies of some rows at a time hold less than those of all
+        for at in range(0, len(grad), ROWS_TOGETHER):
+            update(*(t[at : at + ROWS_TOGETHER] for t in tensors), rate, index, first + at * width)
+        return
+    if is_short(exp_avg):
+        moments = exp_avg.float(), exp_avg_sq.float()
+        update(value, grad, *moments, rate, index)
+        exp_avg.copy_(moments[0])
+        places = torch.arange(first, first + value.numel(), device=value.device)
+        exp_avg_sq.view(-1).copy_(dithered(moments[1].view(-1), places, index))
         return
     rate, correction = _corrected(rate, index)
-    if native.module() is not None and all(_plain(t) for t in tensors):
-        native.kernels().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
+    grad = grad.contiguous()
+    if native.module() is not None and all(_plain(t) for t in (value, grad, exp_avg, exp_avg_sq)):
+        numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
+        native.kernels().adam(value, grad, exp_avg, exp_avg_sq, *numbers)
         return
     exp_avg.lerp_(grad, 1 - BETA1)
     exp_avg_sq.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
@@ -112,18 +134,30 @@ def update_rows(
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
         native.kernels().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
-    some, first, second = (tensor.index_select(0, rows) for tensor in (value, exp_avg, exp_avg_sq))
+    some, first, second = (tensor.index_select(0, rows).float() for tensor in (value, exp_avg, exp_avg_sq))
     second *= kept.view(-1, *[1] * (value.dim() - 1))
     update(some, grad, first, second, rate, index)
-    for tensor, part in zip((value, exp_avg, exp_avg_sq), (some, first, second), strict=True):
-        tensor[rows] = part
+    value[rows], exp_avg[rows] = some, first.to(exp_avg.dtype)
+    if is_short(exp_avg_sq):
+        width = value[:1].numel()
+        places = (rows[:, None] * width + torch.arange(width, device=rows.device)).flatten()
+        second = dithered(second.view(-1), places, index).view_as(second)
+    exp_avg_sq[rows] = second
 
 
 def launch_update(
-    on: Kernels, value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int
+    on: Kernels,
+    value: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rate: float,
+    index: int,
+    first: int = 0,
 ) -> None:
     """What `update` does to tensors of one shape (N, ...), by the kernel of adam.cu."""
-    on.launch("adam", _blocks(grad), 256, value, grad, exp_avg, exp_avg_sq, *_numbers(rate, index))
+    name, moments = _kernel("adam", exp_avg, exp_avg_sq)
+    on.launch(name, _blocks(grad), 256, value, grad, *moments, first, *_numbers(rate, index))
 
 
 def launch_update_rows(
@@ -139,8 +173,15 @@ def launch_update_rows(
 ) -> None:
     """What `update_rows` does to (R,) rows of tensors (N, ...), by the kernel of adam.cu."""
     wide = grad[:1].numel()
-    tensors = value, rows, kept, grad, exp_avg, exp_avg_sq
-    on.launch("adam_rows", _blocks(grad), 256, *tensors, wide, *_numbers(rate, index))
+    name, moments = _kernel("adam_rows", exp_avg, exp_avg_sq)
+    on.launch(name, _blocks(grad), 256, value, rows, kept, grad, *moments, wide, *_numbers(rate, index))
+
+
+def _kernel(name: str, *moments: Tensor) -> tuple[str, list[Tensor]]:
+    """The kernel for moments of their type, and these as it takes them."""
+    if is_short(moments[0]):
+        return f"{name}_16", [moment.view(torch.int16) for moment in moments]
+    return name, list(moments)
 
 
 def _blocks(grad: Tensor) -> int:
@@ -149,7 +190,7 @@ def _blocks(grad: Tensor) -> int:
 
 def _numbers(rate: float, index: int) -> tuple[float, ...]:
     rate, correction = _corrected(rate, index)
-    return rate, 1 - BETA1, 1 - BETA2, correction, EPSILON
+    return rate, 1 - BETA1, 1 - BETA2, correction, EPSILON, index
 
 
 def _corrected(rate: float, index: int) -> tuple[float, float]:
@@ -158,7 +199,7 @@ def _corrected(rate: float, index: int) -> tuple[float, float]:
 
 
 def _is_gpu(tensor: Tensor) -> bool:
-    return tensor.device.type == "cuda" and tensor.dtype == torch.float32 and tensor.is_contiguous()
+    return tensor.device.type == "cuda" and tensor.dtype in (torch.float32, SHORT) and tensor.is_contiguous()
 
 
 def _plain(tensor: Tensor) -> bool:

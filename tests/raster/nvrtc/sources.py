@@ -40,7 +40,7 @@ def raster(name: str, kind: int = rasterizer.SURFEL) -> CudaSource:
 
 
 SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
-    (adam.ADAM_SOURCE, {"adam": (40, 0), "adam_rows": (64, 0)}),
+    (adam.ADAM_SOURCE, {"adam": (40, 0), "adam_16": (40, 0), "adam_rows": (64, 0), "adam_rows_16": (64, 0)}),
     (ssim.SSIM_SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
     (grid.FUSION_SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
     (passes.SOURCE_BY_SAMPLES[16], {"improve": (128, 0, 1000)}),

@@ -42,6 +42,26 @@ def test_some_rows_agree_with_the_cpu(load, shape):
         assert torch.allclose(our.cpu(), their, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.parametrize("shape", [(1025,), (131, 15, 3)])
+def test_moments_in_16_bits_are_those_of_the_cpu(load, shape):
+    """Rounded in the same way: the same bits, but where the arithmetic before has another last bit of 24."""
+    on = load(ADAM_SOURCE)
+    draw = torch.Generator().manual_seed(len(shape))
+    theirs = [torch.randn(shape, generator=draw), *torch.zeros(2, *shape, dtype=torch.bfloat16)]
+    ours = [tensor.clone().to(on.device) for tensor in theirs]
+    for index in range(1, 8):
+        rows = (torch.rand(shape[0], generator=draw) < 0.6).nonzero()[:, 0]
+        kept, grad = torch.rand(len(rows), generator=draw), torch.randn(shape, generator=draw)
+        there = [tensor.to(on.device) for tensor in (rows, kept, grad, grad[rows])]
+        launch_update(on, ours[0], there[2], *ours[1:], 0.01, index, 7)
+        update(theirs[0], grad, *theirs[1:], 0.01, index, 7)
+        launch_update_rows(on, ours[0], *there[:2], there[3], *ours[1:], 0.01, index)
+        update_rows(theirs[0], rows, kept, grad[rows], *theirs[1:], 0.01, index)
+    for our, their in zip(ours[1:], theirs[1:], strict=True):
+        assert our.dtype == torch.bfloat16 and (our.cpu() == their).float().mean() > 0.995
+    assert torch.allclose(ours[0].cpu(), theirs[0], rtol=1e-3, atol=1e-4)
+
+
 def test_columns_without_gradient_stay(monkeypatch):
     """`adam_step` takes the kernel for tensors of a GPU: here for all."""
     launched = []

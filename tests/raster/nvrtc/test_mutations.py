@@ -57,7 +57,7 @@ def test_mistakes_in_similarity(name):
 
 
 def test_mistakes_in_adam():
-    source = changed(adam.ADAM_SOURCE, "i >= value.size", "i > value.size")
+    source = changed(adam.ADAM_SOURCE, "i >= gradient.size", "i > gradient.size")
     tensors = [torch.rand(100) for _ in range(4)]
     with pytest.raises(KernelError, match="index 100 of gradient, .*100 elements"):
         adam.launch_update(Emulated(source), *tensors, 0.1, 1)
