@@ -1,9 +1,11 @@
-"""The optimiser, over the columns of `Points`."""
+"""Adam (Kingma and Ba 2015), over the columns of `Points`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -12,6 +14,7 @@ from surfkit.primitives.points import Columns, Points
 from surfkit.raster import native
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
+from surfkit.train.optimizer import Optimizer, OptimizerInput
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
@@ -19,6 +22,24 @@ VALUES_PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
+
+
+@dataclass(frozen=True)
+class Adam(Optimizer):
+    """Adam for all points: those out of view move on by momentum, as in 3DGS."""
+
+    def step(self, points: Points, grads: Columns, given: OptimizerInput) -> None:
+        """See `Optimizer.step`."""
+        adam_step(points, grads, given.rates, given.index, given.rows)
+
+
+@dataclass(frozen=True)
+class AdamInView(Adam):
+    """Adam for the points that the view may show: a step then costs what its view shows, whatever the size of the
+    scene (but for what policies look at). Stages with regularizers, steps with a second view, and primitives that draw
+    themselves or have parameters that belong to no point always update all."""
+
+    in_view: ClassVar[bool] = True
 
 
 @torch.no_grad()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Render, Splats
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView
+from surfkit.train.loss_gradients import pulled
 
 
 @dataclass(frozen=True)
@@ -36,3 +39,12 @@ class StepResult:
     losses: dict[str, float]
     gradients: Gradients
     appearance: ImageAppearance | None
+
+    @property
+    def rows(self) -> Tensor | None:
+        """(R,) int64, the points that the step is for; None for all."""
+        return None if self.in_view is None else self.in_view.rows
+
+    def pull(self, cotangents: Maps) -> Columns:
+        """See `OptimizerInput.pull`."""
+        return pulled(self.shape, self.render.backward(cotangents, rows=len(self.shape)), self.leaves, again=True)
