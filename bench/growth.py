@@ -1,10 +1,10 @@
 """What a step costs as a survey grows: `python bench/growth.py --photographs 2000 8000`.
 
 Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
-many points in each view whatever the number of photographs. For each survey and each way to update, a process of its
-own takes steps of 2DGS, without densification or, with --policies, between its edits, spread over all photographs: the median CPU time of a step, all
-threads, and the peak of the memory. Points are made at once, not read; photographs are noise, made when they are asked
-for, so that neither files nor the cache count.
+many points in each view whatever the number of photographs. For each survey and each optimizer, a process of its own
+takes steps of 2DGS, without densification or, with --policies, between its edits. They are spread over all photographs:
+the median CPU time of a step, all threads, and the peak of the memory. Points are made at once, not read; photographs
+are noise, made when they are asked for, so that neither files nor the cache count.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from machine import save
 from torch import Tensor
 
 from surfkit.core.memory import peak_memory_bytes
+from surfkit.core.registry import find
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View
 from surfkit.study.recipes import SURFELS
+from surfkit.train.optimizer import Optimizer
 from surfkit.train.trainer import Trainer
 
 POINTS_PER_PHOTOGRAPH = 198
@@ -69,10 +71,10 @@ def survey(photographs: int) -> tuple[tuple[View, ...], SparsePoints]:
     return tuple(views), SparsePoints(xyz, rgb, size=torch.full((count,), 0.5 * 2 / math.sqrt(count)))
 
 
-def measured(photographs: int, update: str, steps: int, policies: bool) -> dict[str, float]:
+def measured(photographs: int, optimizer: str, steps: int, policies: bool) -> dict[str, float]:
     """Median CPU milliseconds of a step, and the peak of this process."""
     views, cloud = survey(photographs)
-    stage = replace(SURFELS.pretrain, steps=30_000, update=update)
+    stage = replace(SURFELS.pretrain, steps=30_000, optimizer=find(Optimizer, optimizer)())
     stage = stage if policies else replace(stage, densify=None, prune=())
     rasterizer, _ = select("cpu")
     trainer = Trainer(stage, SURFELS.primitive, views, Noise(photographs), rasterizer)
@@ -96,22 +98,22 @@ def measured(photographs: int, update: str, steps: int, policies: bool) -> dict[
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photographs", type=int, nargs="+", default=[2000, 8000])
-    parser.add_argument("--updates", nargs="+", default=["all", "in-view"])
+    parser.add_argument("--optimizers", nargs="+", default=["adam", "adam-in-view"])
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--policies", action="store_true", help="with the recipe's densification and pruning")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
-        print(json.dumps(measured(given.photographs[0], given.updates[0], given.steps, given.policies)))
+        print(json.dumps(measured(given.photographs[0], given.optimizers[0], given.steps, given.policies)))
         return
     figures = {}
-    for update in given.updates:
+    for optimizer in given.optimizers:
         for photographs in given.photographs:
-            words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--updates", update]
+            words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--optimizers", optimizer]
             words += ["--policies"] * given.policies
             said = subprocess.run([*words, "--steps", str(given.steps)], stdout=subprocess.PIPE, text=True, check=True)
-            figures[f"{update} {photographs}" + " policies" * given.policies] = found = json.loads(said.stdout)
-            print(update, photographs, *(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
+            figures[f"{optimizer} {photographs}" + " policies" * given.policies] = found = json.loads(said.stdout)
+            print(optimizer, photographs, *(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
     print(f"wrote {save('growth', figures)}")
 
 

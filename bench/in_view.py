@@ -20,6 +20,7 @@ from surfkit.raster.select import select
 from surfkit.scene.photos import view_photo
 from surfkit.study.recipes import RECIPES
 from surfkit.train import checkpoint
+from surfkit.train.adam import Adam, AdamInView
 from surfkit.train.in_view import PointsInView
 from surfkit.train.trainer import Trainer
 
@@ -36,10 +37,13 @@ def main() -> None:
     stage = replace(recipe.pretrain, densify=None, losses={n: recipe.pretrain.losses[n] for n in ("l1", "ssim")})
     photos, (rasterizer, _) = [view_photo(view) for view in scene.train], select("cpu")
     ways = {}
-    for update in ("all", "in-view"):
+    for name, optimizer in (("all", Adam()), ("in-view", AdamInView())):
         state = checkpoint.load(options.run / "pretrain" / "checkpoint.safetensors")
         state.points.stats.clear()
-        ways[update] = Trainer(replace(stage, update=update), recipe.primitive, scene.train, photos, rasterizer), state
+        ways[name] = (
+            Trainer(replace(stage, optimizer=optimizer), recipe.primitive, scene.train, photos, rasterizer),
+            state,
+        )
     times: dict[str, list[float]] = {name: [] for name in ways}
     shares = []
     for index in range(options.rounds + 3):

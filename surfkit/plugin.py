@@ -97,6 +97,7 @@ from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
 from surfkit.train.interrupt import graceful
+from surfkit.train.optimizer import Optimizer, OptimizerInput
 from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
 
@@ -186,6 +187,8 @@ __all__ = [
     "NewPoints",
     "NormalConsistency",
     "Observations",
+    "Optimizer",
+    "OptimizerInput",
     "Partition",
     "PhotoSkipped",
     "Pixels",

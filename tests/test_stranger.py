@@ -25,6 +25,7 @@ from surfkit.runs import run_stage as stage
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
+from surfkit.train.optimizer import Optimizer
 
 SOURCE = Path(__file__).parent / "stranger"
 WORDS = {
@@ -34,9 +35,10 @@ WORDS = {
     "cards": "mesh:cards",
     "balls": "primitive:balls",
     "blend": "pretrain.signal:blend",
+    "steady": "pretrain.optimizer:steady",
 }
 KINDS = {"far": Prune, "charbonnier": Loss, "top-share": Densify, "cards": Mesher, "balls": Primitive}
-KINDS |= {"blend": Signal}
+KINDS |= {"blend": Signal, "steady": Optimizer}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -112,7 +114,7 @@ def test_the_parts_are_listed_with_where_they_come_from(capsys):
         line = next(line for line in lines if line.split()[:2] == [kind.__name__.lower(), name])
         assert line.split()[-1] == "acme-surfkit"
     assert main(["plugins"]) == 0
-    offers = "far, charbonnier, top-share, cards, balls, blend, recipe:acme, table:acme, command extent"
+    offers = "far, charbonnier, top-share, cards, balls, blend, steady, recipe:acme, table:acme, command extent"
     assert re.search(f"acme +acme-surfkit +1.2 +{offers}", capsys.readouterr().out)
 
 
@@ -178,7 +180,7 @@ def test_one_word_puts_a_part_in_the_place_of_another(train, tmp_path, name):
 
 def test_an_ablation_table_of_them_and_its_report(data, tmp_path, capsys):
     words = ["--data", str(data), "--steps", "4", "--out", str(tmp_path), "--probe", "0"]
-    rows = ["+ top share", "+ cards", "+ blend", "recipe of Acme"]
+    rows = ["+ top share", "+ cards", "+ blend", "+ steady", "recipe of Acme"]
     assert main(["ablate", "table:acme", *words, "--rows", "1", *rows, "--max-points", "130"]) == 0
     printed = capsys.readouterr().out
     assert all(row in printed for row in rows)

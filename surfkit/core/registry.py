@@ -29,7 +29,7 @@ from surfkit.core.version import own_version
 
 _FOLDERS = """
 io.splats io.datasets raster apps.sfm primitives losses depth start appearance densify mesh partition compress
-runs.execute train.refine compress.levels runs.methods study.recipes apps
+runs.execute train train.refine compress.levels runs.methods study.recipes apps
 """
 BUILTIN = tuple(f"surfkit.{name}" for name in _FOLDERS.split())
 

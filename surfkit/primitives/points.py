@@ -31,12 +31,9 @@ class Points:
     shared: Columns = field(default_factory=dict)
 
     @classmethod
-    def fresh(cls, params: Columns, shared: Iterable[str] = (), moments: torch.dtype = torch.float32) -> Points:
-        """Points that have not been optimised yet, with moments of a type; `shared` names the parameters that belong to
-        no point."""
-        first, second = (
-            {name: torch.zeros_like(value, dtype=moments) for name, value in params.items()} for _ in range(2)
-        )
+    def fresh(cls, params: Columns, shared: Iterable[str] = ()) -> Points:
+        """Points that have not been optimised yet; `shared` names the parameters that belong to no point."""
+        first, second = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
         common = {name: params[name] for name in shared}
         own = {name: value for name, value in params.items() if name not in common}
         return cls(own, first, second, shared=common)
@@ -77,6 +74,13 @@ class Points:
 
         joined = {name: torch.cat([value, params[name]]) for name, value in self.params.items()}
         return Points(joined, padded(self.exp_avg), padded(self.exp_avg_sq), padded(self.stats), self.shared)
+
+    def with_moments(self, kind: torch.dtype) -> Points:
+        """These points with moments of another type."""
+        first, second = (
+            {name: value.to(kind) for name, value in group.items()} for group in (self.exp_avg, self.exp_avg_sq)
+        )
+        return replace(self, exp_avg=first, exp_avg_sq=second)
 
     def to(self, device: torch.device | str) -> Points:
         """These points on another device."""

@@ -13,6 +13,7 @@ from surfkit.testing.format_checks import check_format
 from surfkit.testing.image_part_checks import check_appearance, check_depth_estimator, check_loss, check_regularizer
 from surfkit.testing.levels import check_levels_of_detail
 from surfkit.testing.method_checks import check_method
+from surfkit.testing.optimizer_checks import check_optimizer
 from surfkit.testing.policy_checks import (
     check_densify,
     check_filter,
@@ -44,6 +45,7 @@ __all__ = [
     "check_loss",
     "check_mesher",
     "check_method",
+    "check_optimizer",
     "check_partition",
     "check_policy",
     "check_primitive",

@@ -1,9 +1,11 @@
-"""The optimiser, over the columns of `Points`."""
+"""Adam (Kingma and Ba 2015), over the columns of `Points`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from surfkit.raster import native
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels, kernels
 from surfkit.train.moments import SHORT, dithered, is_short
+from surfkit.train.optimizer import Optimizer, OptimizerInput
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
@@ -22,6 +25,32 @@ ROWS_TOGETHER = 2**17
 """Rows that are copied together where the kernels cannot take the tensors as they are."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
+
+
+@dataclass(frozen=True)
+class Adam(Optimizer):
+    """Adam for all points: those out of view move on by momentum, as in 3DGS."""
+
+    moments: Literal["float32", "bfloat16"] = "float32"
+    """How the two moments of each parameter are kept. bfloat16 takes a third less memory for parameters and moments;
+    the length of a step is then 2.5 % off at random."""
+
+    def moment_type(self) -> torch.dtype:
+        """See `Optimizer.moment_type`."""
+        return SHORT if self.moments == "bfloat16" else torch.float32
+
+    def step(self, points: Points, grads: Columns, given: OptimizerInput) -> None:
+        """See `Optimizer.step`."""
+        adam_step(points, grads, given.rates, given.index, given.rows)
+
+
+@dataclass(frozen=True)
+class AdamInView(Adam):
+    """Adam for the points that the view may show: a step then costs what its view shows, whatever the size of the
+    scene (but for what policies look at). Stages with regularizers, steps with a second view, and primitives that draw
+    themselves or have parameters that belong to no point always update all."""
+
+    in_view: ClassVar[bool] = True
 
 
 @torch.no_grad()
@@ -80,7 +109,8 @@ def update(
     if len(grad) > ROWS_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
         width = grad[0].numel()  # copies of some rows at a time hold less than those of all
         for at in range(0, len(grad), ROWS_TOGETHER):
-            update(*(t[at : at + ROWS_TOGETHER] for t in tensors), rate, index, first + at * width)
+            p, g, m, v = (t[at : at + ROWS_TOGETHER] for t in tensors)
+            update(p, g, m, v, rate, index, first + at * width)
         return
     if is_short(exp_avg):
         moments = exp_avg.float(), exp_avg_sq.float()

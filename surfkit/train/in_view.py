@@ -51,9 +51,9 @@ class PointsInView:
 
     @classmethod
     def of_step(cls, setup: StageSetup, state: StageState, camera: Camera) -> PointsInView | None:
-        """The points that the coming step is for; None where it is for all (`Stage.update`)."""
+        """The points that the coming step is for; None where it is for all (`Optimizer.in_view`)."""
         stage = setup.stage
-        if stage.update == "all" or stage.regularizers or stage.is_paired(state.index + 1):
+        if not stage.optimizer.in_view or stage.regularizers or stage.is_paired(state.index + 1):
             return None  # regularizers and second views look at other points too
         if setup.draws is not setup.rasterizer or state.points.shared:
             return None

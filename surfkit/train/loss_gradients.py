@@ -88,16 +88,19 @@ def as_numbers(values: Mapping[str, Tensor]) -> dict[str, float]:
     return dict(zip(values, together.tolist(), strict=True))
 
 
-def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:
+def pulled(
+    shape: Splats, gradients: Gradients, leaves: Columns, terms: Sequence[Tensor] = (), again: bool = False
+) -> Columns:
     """Gradients by the raw parameters, (N, ...) each, from those by the splats and from terms on the splats, scalars.
 
     A parameter without influence is left out. Of one that is a part of a larger tensor of the splats, such as the first
-    of the harmonics, the gradient may be a part of that tensor's, whose rows do not follow each other.
+    of the harmonics, the gradient may be a part of that tensor's, whose rows do not follow each other. `again` keeps
+    the graph, to pull other gradients.
     """
     splats, grads = shape.named(), gradients.named()
     names = [name for name, value in splats.items() if value.requires_grad and name in grads]
     known = _KnownGradient.apply([grads[name] for name in names], *(splats[name] for name in names))  # type: ignore[no-untyped-call]
-    raw = torch.autograd.grad([known, *terms], list(leaves.values()), allow_unused=True)
+    raw = torch.autograd.grad([known, *terms], list(leaves.values()), allow_unused=True, retain_graph=again)
     return {name: grad for name, grad in zip(leaves, raw, strict=True) if grad is not None}
 
 

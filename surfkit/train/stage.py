@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
@@ -16,6 +16,8 @@ from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
+from surfkit.train.adam import Adam
+from surfkit.train.optimizer import Optimizer
 from surfkit.train.state import StageState
 
 MAX_STAGE_STEPS = 100_000_000
@@ -57,11 +59,8 @@ class Stage:
     near: float = 0.005
     """Nothing nearer to a camera than this is drawn, as a share of the scene extent."""
 
-    update: Literal["all", "in-view"] = "all"
-    """Points that a step updates: all, of which those out of view move on by momentum, as in 3DGS, or only those in
-    view: a step then costs what its view shows, whatever the size of the scene (but for what policies look at). Stages
-    with regularizers, steps with a second view, and primitives that draw themselves or have parameters that belong to
-    no point always update all."""
+    optimizer: Annotated[Optimizer, choice(Optimizer)] = Adam()
+    """What changes the points by the gradients of a step: all points, or only those in view."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_STAGE_STEPS:

@@ -13,12 +13,12 @@ from surfkit.core.events import PointsEdited, emit
 from surfkit.losses.base import RegularizerInput
 from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.edit import Edit, apply, fitted, observe
-from surfkit.train.adam import adam_step
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
 from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
 from surfkit.train.next_view import neighbour, next_target
+from surfkit.train.optimizer import OptimizerInput
 from surfkit.train.point_blocks import put_in_order
 from surfkit.train.policies import rates_at, told, wanted
 from surfkit.train.required_maps import GEOMETRY_MAPS, maps_of_step
@@ -53,7 +53,8 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     count = len(shape)
     gradients = render.backward(total, chosen, stage.signal.absolute, count)
     drawn = render.maps, render.seen[:count], render.radii[:count]
-    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance)
+    kept = render if stage.optimizer.pulls else None
+    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance, kept)
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
@@ -61,20 +62,20 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     stage, index, view, in_view = setup.stage, state.index + 1, result.target.view.name, result.in_view
     state.whole = False  # until the step is done
 
-    # Update: terms on the points join the gradients on their way to the raw parameters, which Adam then changes.
+    # Update: terms on the points join the gradients on their way to the raw parameters, which the optimizer changes.
     given = index, stage.steps, result.target, result.maps, result.seen, state.points.stat, result.leaves
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
-    edit = None  # policies look at the points as they were drawn
-    if stage.policies:
-        edit = wanted(stage.policies, state.points, told(setup, state, result))
-    grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()))
+    # Policies look at the points as they were drawn.
+    edit = wanted(stage.policies, state.points, told(setup, state, result)) if stage.policies else None
+    grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()), stage.optimizer.pulls)
     if in_view is not None:
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
         result.appearance.learn()
-    adam_step(state.points, grads, rates_at(setup, state), index, None if in_view is None else in_view.rows)
+    about = OptimizerInput(index, rates_at(setup, state), result.rows, state.seed, result.pull)
+    stage.optimizer.step(state.points, grads, about)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
     else:
@@ -91,7 +92,7 @@ def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
     points = apply(setup.primitive, state.points, edit, state.generator)
     if len(points) == 0:
         raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
-    if setup.stage.update == "in-view":
+    if setup.stage.optimizer.in_view:
         put_in_order(points)
     state.points = observe(setup.primitive, points, setup.views, setup.stage.near)
     if edit.max_opacity is not None:

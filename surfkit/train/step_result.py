@@ -8,9 +8,10 @@ from torch import Tensor
 
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Gradients, Maps, Splats
+from surfkit.raster.api import Gradients, Maps, Render, Splats
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView
+from surfkit.train.loss_gradients import pulled
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,13 @@ class StepResult:
         leaves: Raw parameters of these points, or of all, that gradients can be taken by.
         shape: The splats made of them.
         splats: The same, detached, and the frozen ones.
-        maps: The view as drawn; what the way back needed of the drawing is not kept.
+        maps: The view as drawn.
         seen, radii: As in `Render`, of these points.
         losses: Weighted value of each loss.
         gradients: By the splats.
         appearance: That of the photograph, with its gradient, if the stage learns any.
+        render: What goes back once more, for an optimizer that wants other gradients too (`Optimizer.pulls`); None for
+            others, as it holds much of a GPU's memory.
     """
 
     target: Target
@@ -41,3 +44,14 @@ class StepResult:
     losses: dict[str, float]
     gradients: Gradients
     appearance: ImageAppearance | None
+    render: Render | None
+
+    @property
+    def rows(self) -> Tensor | None:
+        """(R,) int64, the points that the step is for; None for all."""
+        return None if self.in_view is None else self.in_view.rows
+
+    def pull(self, cotangents: Maps) -> Columns:
+        """See `OptimizerInput.pull`."""
+        assert self.render is not None, "it is kept for optimizers with `pulls`"
+        return pulled(self.shape, self.render.backward(cotangents, rows=len(self.shape)), self.leaves, again=True)

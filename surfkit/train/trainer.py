@@ -49,6 +49,7 @@ class Trainer(StageSetup):
                 f"primitive {name_of(self.primitive)} declares the columns {', '.join(sorted(declared))}, and its "
                 f"points have {', '.join(sorted(points.all_params()))}"
             )
+        points = points.with_moments(self.stage.optimizer.moment_type())
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.appearances = fresh_appearances(self.stage.appearance, len(self.views))

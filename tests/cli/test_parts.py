@@ -18,6 +18,7 @@ from surfkit.losses.regularizers import MeanOpacity
 from surfkit.losses.surface import Distortion
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.base import Primitive
+from surfkit.train.optimizer import Optimizer
 
 
 def stage(*words: str):
@@ -95,6 +96,7 @@ SLOTS = {
     Regularizer: "pretrain.regularizers.extra",
     Appearance: "pretrain.appearance",
     Signal: "pretrain.signal",
+    Optimizer: "pretrain.optimizer",
     Densify: "pretrain.densify",
     Filter: "pretrain.densify.filters.{}",
     Prune: "pretrain.prune.{}",

@@ -29,8 +29,7 @@ from surfkit.runs import journal, pipeline
 from surfkit.runs.pipeline import Intervals, load_run, run
 from surfkit.runs.recipe import complete, with_steps
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint
-from surfkit.train import step as train_step
+from surfkit.train import adam, checkpoint
 from surfkit.train.progress import TrainingDisplay
 from surfkit.train.trainer import Trainer
 
@@ -367,7 +366,7 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
 @pytest.mark.parametrize("photographs", [3, 1])
 def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkeypatch, photographs):
     """As long as more photographs than some are kept, memory is short, in the middle of a step; nothing is lost."""
-    (data, whole), out, update = finished, tmp_path / "run", train_step.adam_step
+    (data, whole), out, update = finished, tmp_path / "run", adam.adam_step
     kept = []
 
     def short(points, grads, rates, index, rows=None):
@@ -378,7 +377,7 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
 
     given, read_ahead = [], pipeline.read_ahead
     monkeypatch.setattr(pipeline, "read_ahead", lambda *args: given.append(read_ahead(*args)) or given[-1])
-    monkeypatch.setattr(train_step, "adam_step", short)
+    monkeypatch.setattr(adam, "adam_step", short)
     run(recipe, data, out, intervals=Intervals(10))
     times = {3: 1, 1: 2}[photographs]
     assert len(notes(out)) == times and kept[-1] <= photographs * 40 * 30 * 3 < kept[11]

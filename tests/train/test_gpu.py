@@ -22,6 +22,8 @@ from surfkit.raster.cuda.rasterizer import TileRasterizer, source
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.testing.simulated_gpu import GPU, OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.train import checkpoint
+from surfkit.train.adam import Adam, AdamInView
+from surfkit.train.optimizer import Optimizer
 from surfkit.train.stage import Stage
 
 pytestmark = pytest.mark.skipif(
@@ -76,10 +78,10 @@ def places(state):
     return [is_there(value) for group in groups for value in group.values()]
 
 
-@pytest.mark.parametrize("update", ["all", "in-view"])
-def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path, update):
+@pytest.mark.parametrize("optimizer", [Adam(), AdamInView()], ids=["all", "in-view"])
+def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path, optimizer):
     losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
-    stage = Stage(steps=20, losses=losses, densify=EDITS, update=update)
+    stage = Stage(steps=20, losses=losses, densify=EDITS, optimizer=optimizer)
     _, here = trained(begin, stage, tiny.rasterizer, tiny)
     with simulated_gpu() as gpu:
         _, there = trained(begin, stage, OnSimulatedGpu(tiny.rasterizer), tiny)
@@ -94,15 +96,15 @@ def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path, update)
     assert torch.equal(loaded.points.params["means"], there.points.params["means"])
     waits = {name: count for name, count in gpu.waits.items() if name != "to cpu"}  # those are the rasterizer's
     assert waits.pop("tolist") == 2 * 20, "a step waits once for its losses and once for whether all is finite"
-    in_view = 2 * 20 if update == "in-view" else 0
+    in_view = 2 * 20 if optimizer.in_view else 0
     assert waits.get("nonzero", 0) >= in_view, "a step waits for how many points are in blocks in view, and in view"
     assert sum(waits.values()) < 60 + in_view, "edits wait for the numbers of their points, steps do not"
 
 
-@pytest.mark.parametrize("update", ["all", "in-view"])
-def test_with_the_kernels(tiny, begin, update):
+@pytest.mark.parametrize("optimizer", [Adam(), AdamInView()], ids=["all", "in-view"])
+def test_with_the_kernels(tiny, begin, optimizer):
     losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
-    stage = Stage(steps=4, losses=losses, densify=replace(EDITS, start=1, every=2), update=update)
+    stage = Stage(steps=4, losses=losses, densify=replace(EDITS, start=1, every=2), optimizer=optimizer)
     _, here = trained(begin, stage, tiny.rasterizer, tiny)
     with simulated_gpu():
         _, there = trained(begin, stage, EmulatedGpu(), tiny)
@@ -112,11 +114,11 @@ def test_with_the_kernels(tiny, begin, update):
         torch.testing.assert_close(there.points.all_params()[name], value, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("update", ["all", "in-view"])
-def test_a_step_leaves_nothing_on_the_gpu(tiny, begin, update):
+@pytest.mark.parametrize("optimizer", [Adam(), AdamInView()], ids=["all", "in-view"])
+def test_a_step_leaves_nothing_on_the_gpu(tiny, begin, optimizer):
     """Also where Python collects no cycles of references: it does so by the number of objects, not their bytes."""
     losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
-    trainer, _ = begin(Stage(steps=12, losses=losses, update=update))
+    trainer, _ = begin(Stage(steps=12, losses=losses, optimizer=optimizer))
     gc.collect()
     gc.disable()
     try:
@@ -132,7 +134,7 @@ def test_a_step_leaves_nothing_on_the_gpu(tiny, begin, update):
 
 PARTS = [
     (kind, name)
-    for kind in (Loss, Regularizer, Densify, Filter, Prune, Signal, Appearance, Primitive)
+    for kind in (Loss, Regularizer, Densify, Filter, Prune, Signal, Appearance, Optimizer, Primitive)
     for name, cls in components(kind).items()
     if cls.__module__.startswith("surfkit.")
 ]
@@ -162,6 +164,7 @@ def staged(kind, name):
         changes = {
             Regularizer: {"regularizers": {"it": part}},
             Appearance: {"appearance": part},
+            Optimizer: {"optimizer": part},
             Signal: {"signal": part, "densify": edits},
             Filter: {"densify": replace(edits, filters=(part,))},
             Densify: {"densify": part},

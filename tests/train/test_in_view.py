@@ -16,7 +16,7 @@ from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.train import checkpoint, in_view, point_blocks, policies
-from surfkit.train.adam import UPDATED
+from surfkit.train.adam import UPDATED, Adam, AdamInView
 from surfkit.train.faults import Diverged
 from surfkit.train.in_view import PointsInView
 from surfkit.train.point_blocks import put_in_order
@@ -24,7 +24,7 @@ from surfkit.train.stage import Stage
 
 from .conftest import looking_down
 
-QUIET = Stage(steps=6, densify=None, sh_every=2, update="in-view")
+QUIET = Stage(steps=6, densify=None, sh_every=2, optimizer=AdamInView())
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def visible(trainer, state, done):
 @pytest.mark.parametrize("primitive", [Surfel2D(1), Gaussian3D(1), Flat3D(1)], ids=lambda part: type(part).__name__)
 def test_only_points_in_view_change(apart, primitive):
     trainer, state = apart(QUIET, primitive)
-    other, whole = apart(replace(QUIET, update="all"), primitive)
+    other, whole = apart(replace(QUIET, optimizer=Adam()), primitive)
     left = 0
     for _ in range(6):
         before, twin = held(state.points), {name: value.clone() for name, value in state.points.params.items()}
@@ -89,8 +89,8 @@ def test_the_first_step_is_that_of_all_points(apart):
     """The gradients are the same, moments begin at 0, and points out of view have no gradient."""
     notes = [Noted(), Noted()]
     states = []
-    for update, note in zip(("in-view", "all"), notes, strict=True):
-        trainer, state = apart(replace(QUIET, update=update, prune=(note,)))
+    for optimizer, note in zip((AdamInView(), Adam()), notes, strict=True):
+        trainer, state = apart(replace(QUIET, optimizer=optimizer, prune=(note,)))
         trainer.step(state)
         states.append(state)
     (one,), (other,) = (note.steps for note in notes)
@@ -119,9 +119,9 @@ class Sums(Prune):
         return None
 
 
-@pytest.mark.parametrize("update", ["all", "in-view"])
-def test_statistics_of_what_is_shown_are_those_of_all(apart, update):
-    trainer, state = apart(replace(QUIET, update=update, prune=(Sums(),)))
+@pytest.mark.parametrize("optimizer", [Adam(), AdamInView()], ids=["all", "in view"])
+def test_statistics_of_what_is_shown_are_those_of_all(apart, optimizer):
+    trainer, state = apart(replace(QUIET, optimizer=optimizer, prune=(Sums(),)))
     list(trainer.run(state))
     stats = state.points.stats
     for name in ("grad", "seen", "size"):
@@ -145,8 +145,8 @@ def test_adc_looks_at_no_other_point_between_edits(apart, monkeypatch):
 ], ids=["regularizers", "two views"])  # fmt: skip
 def test_steps_that_need_all_points_update_all(apart, change):
     found = []
-    for update in ("in-view", "all"):
-        trainer, state = apart(replace(QUIET, update=update, **change))
+    for optimizer in (AdamInView(), Adam()):
+        trainer, state = apart(replace(QUIET, optimizer=optimizer, **change))
         list(trainer.run(state))
         found.append(held(state.points))
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
@@ -166,8 +166,8 @@ def test_training_raises_psnr_as_with_all_points(begin):
     from .test_stage import scored
 
     scores = []
-    for update in ("in-view", "all"):
-        trainer, state = begin(replace(QUIET, steps=60, update=update))
+    for optimizer in (AdamInView(), Adam()):
+        trainer, state = begin(replace(QUIET, steps=60, optimizer=optimizer))
         before = scored(trainer, state)
         list(trainer.run(state))
         scores.append(scored(trainer, state) - before)

@@ -10,7 +10,7 @@ from surfkit.train.moments import SHORT, dithered, mixed
 
 
 def test_the_second_moment_follows_that_of_float32():
-    """Steady gradients, then ones a third as large: to nearest, a moment would stand still from the first to the last."""
+    """Steady gradients, then ones a third as large: to nearest, a moment would stand still."""
     count, draw = 4_000, torch.Generator().manual_seed(0)
     ways = [[torch.zeros(count), *torch.zeros(2, count, dtype=kind)] for kind in (torch.float32, SHORT)]
     for index in range(1, 4_001):
@@ -32,7 +32,7 @@ def test_rows_are_those_of_a_whole_step(compiled, monkeypatch):
         monkeypatch.setattr(native, "module", lambda: None)
     draw = torch.Generator().manual_seed(1)
     start = {"sh_rest": torch.randn(90, 15, 3, generator=draw), "means": torch.randn(90, 3, generator=draw)}
-    ways = [Points.fresh({name: value.clone() for name, value in start.items()}, moments=SHORT) for _ in range(3)]
+    ways = [Points.fresh({name: value.clone() for name, value in start.items()}).with_moments(SHORT) for _ in range(3)]
     rates = {"sh_rest": 0.01, "means": 0.1}
     for index in range(1, 6):
         grads = {name: torch.randn(value.shape, generator=draw) for name, value in start.items()}

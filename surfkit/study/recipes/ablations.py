@@ -244,7 +244,7 @@ SURFACE_TABLE = Table(
         Row("+ shorter truncation, no splats above 64 pixels", {"mesh": SHORT_TRUNCATION}),
         Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
-        Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
+        Row("+ steps for the points in view", {"pretrain.optimizer": surface.SURFACE.pretrain.optimizer}),
         Row("+ higher learning rates, lower ones of positions", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
         Row("+ harmonics of degree 1", {"primitive": surface.SURFACE.primitive}),
         Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),

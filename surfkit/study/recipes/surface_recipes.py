@@ -20,6 +20,7 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.methods.stereo_fusion import StereoFusion
 from surfkit.runs.recipe import Recipe
 from surfkit.start.stereo_start import StereoStart
+from surfkit.train.adam import AdamInView
 from surfkit.train.stage import Stage
 
 # Short runs learn more at higher rates than those of 3DGS, with which they end; four times these are too high for
@@ -68,7 +69,7 @@ SURFACE = Recipe(
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
         rates=SURFACE_RATES,
-        update="in-view",
+        optimizer=AdamInView(),
     ),
     mesh=SURFACE_MESH,
 )

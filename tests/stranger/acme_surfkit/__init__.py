@@ -6,6 +6,7 @@ from acme_surfkit.cards import Cards
 from acme_surfkit.charbonnier import Charbonnier
 from acme_surfkit.extent import Extent
 from acme_surfkit.far import Far
+from acme_surfkit.steady import Steady
 from acme_surfkit.top_share import TopShare
 from surfkit.plugin import Recipe, Row, Stage, Table, hookimpl
 
@@ -14,7 +15,7 @@ from surfkit.plugin import Recipe, Row, Stage, Table, hookimpl
 def surfkit_components():
     """The parts, by the names that users type."""
     parts = {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards, "balls": Balls}
-    return parts | {"blend": Blend}
+    return parts | {"blend": Blend, "steady": Steady}
 
 
 @hookimpl
@@ -39,6 +40,7 @@ def surfkit_tables():
         Row("+ far points dropped", {"pretrain.prune": (Far(),)}),
         Row("+ cards", {"mesh": Cards()}),
         Row("+ blend", {"pretrain.signal": Blend()}),
+        Row("+ steady", {"pretrain.optimizer": Steady()}),
         Row("recipe of Acme", recipe=surfkit_recipes()["acme"]),
     )
     return {"acme": Table("acme", "What each part of Acme brings.", Recipe(pretrain=Stage(steps=6)), rows)}
