@@ -1,12 +1,26 @@
 """Moments in 16 bits."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 
+from surfkit.densify.base import Prune
+from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 from surfkit.raster import native
-from surfkit.train.adam import adam_step, update
+from surfkit.train import adam, checkpoint
+from surfkit.train.adam import Adam, AdamInView, adam_step, update
 from surfkit.train.moments import SHORT, dithered, mixed
+from surfkit.train.stage import Stage
+
+
+@dataclass(frozen=True)
+class Halved(Prune):
+    """Drops every other point after the second step."""
+
+    def edit(self, points, step):
+        return Edit(drop=torch.arange(len(points)) % 2 == 0) if step.index == 2 else None
 
 
 def test_the_second_moment_follows_that_of_float32():
@@ -48,9 +62,25 @@ def test_rows_are_those_of_a_whole_step(compiled, monkeypatch):
         assert ways[0].exp_avg_sq[name].dtype == SHORT
 
 
-def test_pieces_have_the_bits_of_the_whole(monkeypatch):
-    from surfkit.train import adam
+@pytest.mark.parametrize("optimizer", [Adam(moments="bfloat16"), AdamInView(moments="bfloat16")])
+def test_a_run_that_goes_on_has_the_same_bits(begin, tmp_path, optimizer):
+    """A checkpoint keeps the moments as they are, and edits move them."""
+    stage = Stage(steps=6, densify=None, prune=(Halved(),), optimizer=optimizer)
+    trainer, whole = begin(stage)
+    list(trainer.run(whole))
+    trainer, state = begin(stage)
+    for _ in range(3):
+        trainer.step(state)
+    checkpoint.save(tmp_path / "stage", state)
+    state = checkpoint.load(tmp_path / "stage")
+    list(trainer.run(state))
+    for group in ("params", "exp_avg", "exp_avg_sq"):
+        one, other = getattr(whole.points, group), getattr(state.points, group)
+        assert all(torch.equal(one[name], other[name]) for name in one), group
+    assert {value.dtype for value in state.points.exp_avg.values()} == {SHORT}
 
+
+def test_pieces_have_the_bits_of_the_whole(monkeypatch):
     draw = torch.Generator().manual_seed(2)
     whole, pieces = ([torch.zeros(50, 3), *torch.zeros(2, 50, 3, dtype=SHORT)] for _ in range(2))
     for index in range(1, 4):
