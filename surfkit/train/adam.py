@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -21,8 +21,8 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 ADAM_SOURCE = CudaSource(Path(__file__).parent / "cuda" / "adam.cu")
 VALUES_PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
-ROWS_TOGETHER = 2**17
-"""Rows that are copied together where the kernels cannot take the tensors as they are."""
+VALUES_TOGETHER = 2**21
+"""Values that are copied together where the kernels cannot take the tensors as they are."""
 UPDATED = "updated"
 """Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
 
@@ -106,11 +106,10 @@ def update(
     if all(_is_gpu(t) for t in tensors):
         launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index, first)
         return
-    if len(grad) > ROWS_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
+    if grad.numel() > VALUES_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
         width = grad[0].numel()  # copies of some rows at a time hold less than those of all
-        for at in range(0, len(grad), ROWS_TOGETHER):
-            p, g, m, v = (t[at : at + ROWS_TOGETHER] for t in tensors)
-            update(p, g, m, v, rate, index, first + at * width)
+        for some in _pieces(len(grad), width):
+            update(value[some], grad[some], exp_avg[some], exp_avg_sq[some], rate, index, first + some.start * width)
         return
     if is_short(exp_avg):
         moments = exp_avg.float(), exp_avg_sq.float()
@@ -164,12 +163,16 @@ def update_rows(
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
         native.kernels().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
+    width = value[:1].numel()
+    if grad.numel() > VALUES_TOGETHER:
+        for part in _pieces(len(rows), width):
+            update_rows(value, rows[part], kept[part], grad[part], exp_avg, exp_avg_sq, rate, index)
+        return
     some, first, second = (tensor.index_select(0, rows).float() for tensor in (value, exp_avg, exp_avg_sq))
     second *= kept.view(-1, *[1] * (value.dim() - 1))
     update(some, grad, first, second, rate, index)
     value[rows], exp_avg[rows] = some, first.to(exp_avg.dtype)
     if is_short(exp_avg_sq):
-        width = value[:1].numel()
         places = (rows[:, None] * width + torch.arange(width, device=rows.device)).flatten()
         second = dithered(second.view(-1), places, index).view_as(second)
     exp_avg_sq[rows] = second
@@ -205,6 +208,12 @@ def launch_update_rows(
     wide = grad[:1].numel()
     name, moments = _kernel("adam_rows", exp_avg, exp_avg_sq)
     on.launch(name, _blocks(grad), 256, value, rows, kept, grad, *moments, wide, *_numbers(rate, index))
+
+
+def _pieces(rows: int, width: int) -> Iterator[slice]:
+    """Rows of so many values each, some at a time."""
+    many = max(1, VALUES_TOGETHER // width)
+    return (slice(at, at + many) for at in range(0, rows, many))
 
 
 def _kernel(name: str, *moments: Tensor) -> tuple[str, list[Tensor]]:

@@ -24,6 +24,7 @@ from surfkit.core.codec import from_json
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import being_written, remove, sync_folder
 from surfkit.primitives.points import Points
+from surfkit.train.moments import SHORT
 from surfkit.train.state import StageState
 from surfkit.train.view_order import ViewOrder
 
@@ -292,11 +293,13 @@ def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> 
         for name, value in getattr(points, attribute).items():
             if name not in points.shared and (not count or value.shape[:1] != count):
                 raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {sum(count)} points")
-    kinds = [
-        {name: (value.shape, value.dtype) for name, value in group.items()}
-        for group in (points.all_params(), points.exp_avg, points.exp_avg_sq)
-    ]
-    if kinds[0] != kinds[1] or kinds[0] != kinds[2] or not all(kind.is_floating_point for _, kind in kinds[0].values()):
+    params = points.all_params()
+    shapes = {name: value.shape for name, value in params.items()}
+    floats = all(value.is_floating_point() for value in params.values())
+    for moments in (points.exp_avg, points.exp_avg_sq):
+        kinds = all(value.dtype in (SHORT, params[name].dtype) for name, value in moments.items() if name in params)
+        floats = floats and kinds and {name: value.shape for name, value in moments.items()} == shapes
+    if not floats:
         raise _unusable(path, "the optimiser's moments do not fit the parameters")
     size, views = order.numel(), torch.arange(order.numel())
     ordered = order.dtype == torch.int64 and order.dim() == 1 and torch.equal(order.sort().values, views)

@@ -87,7 +87,7 @@ def test_pieces_have_the_bits_of_the_whole(monkeypatch):
         grad = torch.randn(50, 3, generator=draw)
         update(whole[0], grad, *whole[1:], 0.1, index)
         with monkeypatch.context() as small:
-            small.setattr(adam, "ROWS_TOGETHER", 7)
+            small.setattr(adam, "VALUES_TOGETHER", 20)
             update(pieces[0], grad, *pieces[1:], 0.1, index)
     assert all(torch.equal(one, other) for one, other in zip(whole, pieces, strict=True))
 
