@@ -106,6 +106,9 @@ def update(
     if all(_is_gpu(t) for t in tensors):
         launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index, first)
         return
+    if native.module() is not None and all(map(_plain, tensors)) and is_short(exp_avg):
+        _update_short(value, None, None, grad, exp_avg, exp_avg_sq, rate, index, first)
+        return
     if grad.numel() > VALUES_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
         width = grad[0].numel()  # copies of some rows at a time hold less than those of all
         for some in _pieces(len(grad), width):
@@ -119,10 +122,10 @@ def update(
         exp_avg_sq.view(-1).copy_(dithered(moments[1].view(-1), places, index))
         return
     rate, correction = _corrected(rate, index)
-    grad = grad.contiguous()
-    if native.module() is not None and all(_plain(t) for t in (value, grad, exp_avg, exp_avg_sq)):
+    tensors = value, grad.contiguous(), exp_avg, exp_avg_sq
+    if native.module() is not None and all(map(_plain, tensors)):
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
-        native.kernels().adam(value, grad, exp_avg, exp_avg_sq, *numbers)
+        native.kernels().adam(*tensors, *numbers)
         return
     exp_avg.lerp_(grad, 1 - BETA1)
     exp_avg_sq.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
@@ -158,7 +161,10 @@ def update_rows(
             kernels(ADAM_SOURCE, value.device), value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index
         )
         return
-    if native.module() is not None and all(_plain(t) for t in tensors):
+    if native.module() is not None and all(map(_plain, tensors)):
+        if is_short(exp_avg):
+            _update_short(value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index)
+            return
         rate, correction = _corrected(rate, index)
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
         native.kernels().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
@@ -210,6 +216,24 @@ def launch_update_rows(
     on.launch(name, _blocks(grad), 256, value, rows, kept, grad, *moments, wide, *_numbers(rate, index))
 
 
+def _update_short(
+    value: Tensor,
+    rows: Tensor | None,
+    kept: Tensor | None,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rate: float,
+    index: int,
+    first: int = 0,
+) -> None:
+    """`update` or, with rows, `update_rows` with moments in 16 bits, by the compiled kernel."""
+    rate, correction = _corrected(rate, index)
+    numbers = first, index, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
+    moments = exp_avg.view(torch.uint16), exp_avg_sq.view(torch.uint16)
+    native.kernels().adam_short(value, rows, kept, grad, *moments, *numbers)
+
+
 def _pieces(rows: int, width: int) -> Iterator[slice]:
     """Rows of so many values each, some at a time."""
     many = max(1, VALUES_TOGETHER // width)
@@ -242,4 +266,4 @@ def _is_gpu(tensor: Tensor) -> bool:
 
 
 def _plain(tensor: Tensor) -> bool:
-    return tensor.device.type == "cpu" and tensor.dtype == torch.float32 and tensor.is_contiguous()
+    return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, SHORT) and tensor.is_contiguous()

@@ -25,6 +25,7 @@ constexpr int64_t kRowsOfAdam = 256;  // updated as one piece of work
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
+using Shorts = nb::ndarray<uint16_t, nb::c_contig, nb::device::cpu>;
 using Points = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Optional = std::optional<Array>;
 
@@ -197,6 +198,23 @@ void add_raster(nb::module_& m) {
             kernels().adam_rows(row + at, std::min(kRowsOfAdam, n - at), wide, decay + at, p, g + at * wide, m1, m2,
                                 (float)rate, (float)(1 - beta1), (float)(1 - beta2), (float)second_correction,
                                 (float)epsilon);
+        });
+    });
+    m.def("adam_short", [](Array value, std::optional<Counts> rows, std::optional<Array> kept, Array gradient,
+                           Shorts first, Shorts second, int64_t origin, int64_t step, double rate, double beta1,
+                           double beta2, double second_correction, double epsilon, int threads) {
+        const int64_t n = (int64_t)gradient.shape(0), wide = n ? (int64_t)gradient.size() / n : 0;
+        float *p = value.data(), *decay = kept ? kept->data() : nullptr;
+        uint16_t *m1 = first.data(), *m2 = second.data();
+        const float* g = gradient.data();
+        const int64_t* row = rows ? rows->data() : nullptr;
+        nb::gil_scoped_release free;
+        parallel(wide ? (n + kRowsOfAdam - 1) / kRowsOfAdam : 0, threads, [&](int64_t piece) {
+            const int64_t at = piece * kRowsOfAdam, here = row ? 0 : at * wide;
+            kernels().adam_short(row ? row + at : nullptr, std::min(kRowsOfAdam, n - at), wide,
+                                 decay ? decay + at : nullptr, p + here, g + at * wide, m1 + here, m2 + here,
+                                 origin + here, (uint32_t)step, (float)rate, (float)(1 - beta1), (float)(1 - beta2),
+                                 (float)second_correction, (float)epsilon);
         });
     });
     m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2,

@@ -2,6 +2,8 @@
 // like it compiled once per instruction set.
 #pragma once
 
+#include <vector>
+
 #include "../native/buffer.h"
 #include "../native/simd.h"
 #include "kernels.h"
@@ -250,6 +252,56 @@ void adam_rows(const int64_t* rows, int64_t count, int64_t wide, const float* ke
         }
         adam((r - begin) * wide, value + at, gradient + begin * wide, first + at, second + at, rate, share1, share2,
              second_correction, epsilon);
+    }
+}
+
+// ---- Moments in 16 bits: the upper halves of floats
+
+inline uint32_t bits_of(float x) {
+    uint32_t bits;
+    std::memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+inline void widen(int64_t count, const uint16_t* from, float* to) {
+    for (int64_t k = 0; k < count; k++) {
+        const uint32_t bits = (uint32_t)from[k] << 16;
+        std::memcpy(to + k, &bits, sizeof bits);
+    }
+}
+inline void narrow_to_nearest(int64_t count, const float* from, uint16_t* to) {
+    for (int64_t k = 0; k < count; k++) {
+        const uint32_t bits = bits_of(from[k]);
+        to[k] = (uint16_t)((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+    }
+}
+inline void narrow_dithered(int64_t count, const float* from, uint16_t* to, uint32_t place, uint32_t step) {
+    for (int64_t k = 0; k < count; k++) {
+        uint32_t h = (place + (uint32_t)k) * 0x9e3779b1u + step * 0x85ebca77u;
+        h = (h ^ h >> 16) * 0x7feb352du;
+        h = (h ^ h >> 15) * 0x846ca68bu;
+        to[k] = (uint16_t)((bits_of(from[k]) + (h >> 16)) >> 16);
+    }
+}
+
+void adam_short(const int64_t* rows, int64_t count, int64_t wide, const float* kept, float* value,
+                const float* gradient, uint16_t* first, uint16_t* second, int64_t origin, uint32_t step, float rate,
+                float share1, float share2, float second_correction, float epsilon) {
+    const int64_t some = std::max<int64_t>(1, 1024 / wide);  // rows that are widened together
+    std::vector<float> m(some * wide), v(some * wide);
+    for (int64_t r = 0; r < count;) {
+        const int64_t begin = r, at = (rows ? rows[begin] : begin) * wide;
+        do r++;
+        while (r < count && r - begin < some && (!rows || rows[r] == rows[begin] + r - begin));
+        const int64_t n = (r - begin) * wide;
+        widen(n, first + at, m.data());
+        widen(n, second + at, v.data());
+        if (kept)
+            for (int64_t k = 0; k < r - begin; k++)
+                for (int64_t c = 0; c < wide; c++) v[k * wide + c] *= kept[begin + k];
+        adam(n, value + at, gradient + begin * wide, m.data(), v.data(), rate, share1, share2, second_correction,
+             epsilon);
+        narrow_to_nearest(n, m.data(), first + at);
+        narrow_dithered(n, v.data(), second + at, (uint32_t)(origin + at), step);
     }
 }
 

@@ -481,7 +481,8 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                shade_some_backward,
                                add_rows,
                                adam,
-                               adam_rows};
+                               adam_rows,
+                               adam_short};
     return table;
 }
 

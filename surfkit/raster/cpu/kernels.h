@@ -113,6 +113,11 @@ struct Kernels {
     void (*adam_rows)(const int64_t* rows, int64_t count, int64_t wide, const float* kept, float* value,
                       const float* gradient, float* first, float* second, float rate, float share1, float share2,
                       float second_correction, float epsilon);
+    // Both with moments in 16 bits, rounded as train/moments.py says. `rows` and `kept` may be none: for all rows then.
+    // The values begin at `origin` of their column.
+    void (*adam_short)(const int64_t* rows, int64_t count, int64_t wide, const float* kept, float* value,
+                       const float* gradient, uint16_t* first, uint16_t* second, int64_t origin, uint32_t step,
+                       float rate, float share1, float share2, float second_correction, float epsilon);
 };
 
 const Kernels& kernels_avx512();
