@@ -129,7 +129,9 @@ def train(work: TrialJob) -> dict[str, Any]:
     gc.collect()  # else what the row before has left would count as memory of this one
     compute, caches = Compute(work.device), CacheSettings(work.cache)
     intervals = Intervals(work.checkpoint_every)
-    return pipeline.run(trial.recipe, trial.data, trial.folder, compute, intervals=intervals, caches=caches, store=store)
+    return pipeline.run(
+        trial.recipe, trial.data, trial.folder, compute, intervals=intervals, caches=caches, store=store
+    )
 
 
 def measured(work: TrialJob, found: dict[str, int | float]) -> dict[str, int | float]:

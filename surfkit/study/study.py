@@ -113,9 +113,7 @@ class AblationPlan:
     def work(self, trial: Trial) -> TrialJob:
         """What a process needs to know to run a trial."""
         store = self.out / STORE if self.shared else None
-        return TrialJob(
-            trial, self.out, self.device, store, lpips=self.lpips, checkpoint_every=self.checkpoint_every
-        )
+        return TrialJob(trial, self.out, self.device, store, lpips=self.lpips, checkpoint_every=self.checkpoint_every)
 
     @property
     def lpips(self) -> bool:
