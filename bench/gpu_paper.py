@@ -63,8 +63,10 @@ STOP_S = 20.0
 """For what is cut, to save its state; after that the process is killed."""
 ROWS = {"gradient": ("1", "4"), "model": ("1", "2", "3", "4")}
 """Rows by table."""
-WAVES = (("gradient", ("1", "4")), ("model", ("1", "2", "3")), ("model", ("4",)))
-"""In which order they are trained; the last wants depth maps."""
+WITH_DEPTH = ("model", ("4",))
+"""The row that learns from depth maps."""
+WAVES = (("gradient", ("1", "4")), ("model", ("1", "2", "3")), WITH_DEPTH)
+"""In which order they are trained."""
 TESTS = ("tests/raster/nvrtc", "tests/raster", "tests/train")
 TEST_EVERY = 8
 SAVE_EVERY_S = 10.0
@@ -121,11 +123,21 @@ class Bench:
         self.known: dict[Path, dict[str, Any]] = {}
         self.spent_file = self.work / "seconds.json"
         self.spent = read_json(self.spent_file, dict[str, float]) if self.spent_file.exists() else {}
+        self.part, self.since = "", 0.0
         self.one = threading.Lock()
+
+    def begin(self, part: str) -> None:
+        """From now on, seconds are those of a part."""
+        self.spent.setdefault(part, 0.0)
+        self.part, self.since = part, time.monotonic()
 
     def save(self) -> dict[str, Any]:
         """Write the result as far as it is known, and return its parts."""
         with self.one:
+            if self.part:
+                now = time.monotonic()
+                self.spent[self.part] += now - self.since
+                self.since = now
             parts = {"parity": self.parity(), "table": self.table(), "rows": self.rows()}
             parts = {name: {"seconds": round(self.spent.get(name, 0.0), 1), **it} for name, it in parts.items()}
             write_json(self.spent_file, self.spent)
@@ -216,10 +228,14 @@ class Bench:
     def train(self, until: float) -> None:
         """Train rows, or go on with them."""
         for name, numbers in WAVES:
-            if "4" in numbers and name == "model":
-                scale = [] if self.options.scale is None else ["--scale", self.options.scale]
-                words = ["prepare", "depth", self.options.data, "--test-every", TEST_EVERY, *scale]
-                run_program(["-m", "surfkit", *words, "--device", self.options.device], until, self.work / "depth.log")
+            if (name, numbers) == WITH_DEPTH:
+                log, scale = self.work / "depth.log", self.options.scale
+                words = ["prepare", "depth", self.options.data.resolve(), "--test-every", TEST_EVERY]
+                words += ["--device", self.options.device, *([] if scale is None else ["--scale", scale])]
+                run_program(["-m", "surfkit", *words], until, log)
+                if (state := state_of(log, "while maps were estimated")) != "finished":
+                    print(f"rows: no depth maps for {name} {numbers[0]}: {state}; see {log}", flush=True)
+                    return
             with Screen(self) as screen:
                 ablate(replace(self.plans[name], rows=numbers), screen)
 
@@ -311,13 +327,11 @@ def measure(options: argparse.Namespace) -> int:
         with saved_often(bench):
             for part, seconds in options.parts.items():
                 until += seconds
-                before = time.monotonic()
-                bench.spent.setdefault(part, 0.0)
+                bench.begin(part)
                 print(f"{part}: until {until - began:.0f} s", flush=True)
                 try:
                     bench.run(part, until)
                 finally:
-                    bench.spent[part] += time.monotonic() - before
                     state = bench.save()[part]["state"]
                     print(f"{part}: {state}, after {time.monotonic() - began:.0f} s", flush=True)
     except KeyboardInterrupt:
