@@ -5,6 +5,4 @@
 #     bench/gpu_paper.sh                                # the same as parity=90 table=50 rows=380
 #     bench/gpu_paper.sh rows=500                       # goes on with the rows
 #     bench/gpu_paper.sh --device cpu --steps 60 --scale 8 --points 5000 --rounds 1 --out /tmp/tried --work /tmp/tried
-set -euo pipefail
-cd "$(dirname "$0")/.."
-exec "${PYTHON:-python3}" bench/gpu_paper.py "$@"
+exec "${PYTHON:-python3}" "$(dirname "$0")/gpu_paper.py" "$@"

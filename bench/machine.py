@@ -27,7 +27,8 @@ def processor() -> str:
 
 def commit() -> str:
     """The commit that was measured, with a mark if files had changed."""
-    result = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    words = ["git", "describe", "--always", "--dirty"]
+    result = subprocess.run(words, cwd=RESULTS.parent, capture_output=True, text=True)
     return result.stdout.strip() or "unknown"
 
 
