@@ -16,11 +16,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from machine import save
+from machine import RESULTS, save
 from scenes import city
 
 from surfkit.compress.cuda.codes import GpuSearch
@@ -217,27 +218,39 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--recipes", nargs="*", default=["2dgs", "citygs2"])
-    parser.add_argument("--name", default="gpu", help="the result is bench/results/NAME.json")
+    parser.add_argument("--name", default="gpu", help="the result is NAME.json")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="its folder")
+    parser.add_argument("--go-on", action="store_true", help="keep what the result of an interrupted call has")
     options = parser.parse_args()
     rasterizer, title = select(options.device)
-    device = rasterizer.where()
-    figures: dict[str, object] = {"device": title, "upload of 12 MP, ms": upload(device, options.rounds)}
-    figures["matching a view, ms"] = matching(device, options.rounds)
-    print(json.dumps(figures), flush=True)
-    figures["fusing a view, ms"] = fusing(device, options.rounds)
-    figures["k-means, ms"] = clustering(device, options.rounds)
-    for kind, name in KINDS.items():
-        for count in options.points:
-            key = f"{name}, {count:,} points"
-            figures[key] = {"surfkit, ms": parts_of(rasterizer, kind, count, options.rounds)}
-            figures[key]["gsplat, ms"] = peer(kind, count, options.rounds, device)
-            print(key, json.dumps(figures[key]), flush=True)
-            print(save(options.name, figures), flush=True)
-    for recipe in options.recipes:
+    path, figures = options.out / f"{options.name}.json", {"device": title}
+    if options.go_on and path.exists() and (known := json.loads(path.read_text())["figures"])["device"] == title:
+        figures = known
+    for name, measure in measurements(rasterizer, options).items():
+        if name not in figures:
+            figures[name] = measure()
+            print(name, json.dumps(figures[name]), flush=True)
+            print(save(options.name, figures, options.out), flush=True)
+
+
+def measurements(rasterizer: Rasterizer, options: argparse.Namespace) -> dict[str, Callable[[], object]]:
+    """What is measured, by name: what tells most comes first, and gsplat last, as it may compile for minutes."""
+    device, rounds = rasterizer.where(), options.rounds
+
+    def trained(recipe: str) -> dict[str, object]:
         where = (options.device, "cpu") if device.type == "cuda" else (options.device,)
-        figures[recipe] = {each: training(each, recipe, options.steps) for each in where}
-        print(recipe, json.dumps(figures[recipe]), flush=True)
-        print(save(options.name, figures), flush=True)
+        return {each: training(each, recipe, options.steps) for each in where}
+
+    scenes = {f"{name}, {count:,} points": (kind, count) for kind, name in KINDS.items() for count in options.points}
+    return {
+        **{f"{name}, ms": partial(parts_of, rasterizer, *it, rounds) for name, it in scenes.items()},
+        "upload of 12 MP, ms": partial(upload, device, rounds),
+        "fusing a view, ms": partial(fusing, device, rounds),
+        "k-means, ms": partial(clustering, device, rounds),
+        "matching a view, ms": partial(matching, device, rounds),
+        **{f"{name}, with gsplat, ms": partial(peer, *it, rounds, device) for name, it in scenes.items()},
+        **{recipe: partial(trained, recipe) for recipe in options.recipes},
+    }
 
 
 def _wait(device: torch.device) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from surfkit.core.codec import write_text
 from surfkit.raster import native
 
 RESULTS = Path(__file__).parent / "results"
@@ -26,13 +27,13 @@ def processor() -> str:
 
 def commit() -> str:
     """The commit that was measured, with a mark if files had changed."""
-    result = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    words = ["git", "describe", "--always", "--dirty"]
+    result = subprocess.run(words, cwd=RESULTS.parent, capture_output=True, text=True)
     return result.stdout.strip() or "unknown"
 
 
-def save(name: str, figures: dict) -> Path:
-    """Keep figures as bench/results/NAME.json with the machine, the commit and the date."""
-    RESULTS.mkdir(exist_ok=True)
+def save(name: str, figures: dict, folder: Path = RESULTS) -> Path:
+    """Keep figures as NAME.json in a folder with the machine, the commit and the date; the file is always whole."""
     about = {
         "machine": f"{processor()}, {torch.get_num_threads()} threads",
         "kernels": native.module().kernels_in_use() if native.module() else "reference",
@@ -40,8 +41,9 @@ def save(name: str, figures: dict) -> Path:
         "commit": commit(),
         "date": time.strftime("%Y-%m-%d"),
     }
-    path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps({**about, "figures": figures}, indent=2) + "\n")
+    path = folder / f"{name}.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps({**about, "figures": figures}, indent=2) + "\n")
     return path
 
 

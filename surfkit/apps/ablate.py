@@ -19,6 +19,7 @@ from surfkit.core.registry import choice
 from surfkit.io.datasets.data import ReadSettings
 from surfkit.raster.select import Device
 from surfkit.runs.execute.base import Executor, Inline
+from surfkit.runs.run_stage import CHECKPOINT_EVERY
 from surfkit.study.ablation import Table
 from surfkit.study.ablation_screen import AblationScreen
 from surfkit.study.ablation_warnings import lines_on_depth, row_numbers
@@ -101,6 +102,9 @@ class AblateCommand:
     """Compute a stage that several rows have in common, such as pretraining, once; it is kept in OUT/stages. The
     results are the same."""
 
+    checkpoint_every: int = CHECKPOINT_EVERY
+    """Steps between checkpoints of a run. The last two are kept; an interruption writes one, too."""
+
     probe: int = 10
     """Optimisation steps that are measured on each data set to estimate time and disk of the table; 0 for no
     estimate."""
@@ -124,6 +128,7 @@ class AblateCommand:
             self.executor,
             self.shared,
             tuple(map(OtherMesh.parsed, self.meshes)),
+            self.checkpoint_every,
         )
         if self.show:
             show(report_so_far(plan))

@@ -27,6 +27,7 @@ from surfkit.runs.execute.base import LOG, Executor, Job, JobResult
 from surfkit.runs.execute.remote import CHILD_POLL_S, DRIVER, INTERRUPTED_STATUS
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.run_notes import collect_notes
+from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals
 from surfkit.runs.stage_cache import StageCache
 from surfkit.study.perceptual import measure_lpips
 from surfkit.study.row_comparison import figures
@@ -66,6 +67,7 @@ class TrialJob:
         store: Folder of finished stages that the rows share; None shares none.
         cache: Memory for photographs, see `CacheSettings`.
         lpips: Whether LPIPS is measured.
+        checkpoint_every: Steps between checkpoints.
     """
 
     trial: Trial
@@ -74,6 +76,7 @@ class TrialJob:
     store: Path | None = None
     cache: str = "auto"
     lpips: bool = False
+    checkpoint_every: int = CHECKPOINT_EVERY
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,10 @@ def train(work: TrialJob) -> dict[str, Any]:
     store = None if work.store is None else StageCache(work.store)
     gc.collect()  # else what the row before has left would count as memory of this one
     compute, caches = Compute(work.device), CacheSettings(work.cache)
-    return pipeline.run(trial.recipe, trial.data, trial.folder, compute, caches=caches, store=store)
+    intervals = Intervals(work.checkpoint_every)
+    return pipeline.run(
+        trial.recipe, trial.data, trial.folder, compute, intervals=intervals, caches=caches, store=store
+    )
 
 
 def measured(work: TrialJob, found: dict[str, int | float]) -> dict[str, int | float]:

@@ -25,7 +25,7 @@ from surfkit.runs.folder import Run, read_record
 from surfkit.runs.recipe import Recipe, complete
 from surfkit.runs.resume import compared_data
 from surfkit.runs.run_cache import versions
-from surfkit.runs.run_stage import select_rasterizer
+from surfkit.runs.run_stage import CHECKPOINT_EVERY, select_rasterizer
 from surfkit.runs.stage_cache import StageCache
 from surfkit.study.ablation import Table, build, limit_points, pick, scaled
 from surfkit.study.ablation_warnings import lacked_maps, notes_of
@@ -69,6 +69,7 @@ class AblationPlan:
         workers: The executor of the rows.
         shared: Whether a stage that several rows have in common is computed once.
         meshes: Of other programs, which are compared with the truth and stand below the rows.
+        checkpoint_every: Steps between checkpoints of a run.
     """
 
     table: Table
@@ -84,10 +85,13 @@ class AblationPlan:
     workers: Executor = Inline()
     shared: bool = True
     meshes: tuple[OtherMesh, ...] = ()
+    checkpoint_every: int = CHECKPOINT_EVERY
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
             raise BadInput(f"--seeds {self.seeds}: give 1 or more")
+        if self.checkpoint_every < 1:
+            raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         refuse_unknown_columns(self.columns)
         paths = [data.path.resolve() for data in self.data]
         if not paths:
@@ -108,7 +112,8 @@ class AblationPlan:
 
     def work(self, trial: Trial) -> TrialJob:
         """What a process needs to know to run a trial."""
-        return TrialJob(trial, self.out, self.device, self.out / STORE if self.shared else None, lpips=self.lpips)
+        store = self.out / STORE if self.shared else None
+        return TrialJob(trial, self.out, self.device, store, lpips=self.lpips, checkpoint_every=self.checkpoint_every)
 
     @property
     def lpips(self) -> bool:

@@ -118,6 +118,24 @@ def test_a_real_table_interrupted_and_continued(scene, monkeypatch, tmp_path, ca
     assert rows[0][3]["difference"]["psnr"]["seeds"] == 1
 
 
+@pytest.mark.parametrize("workers", [(), ("executor:pool", "--executor.workers", "1")], ids=["here", "elsewhere"])
+def test_checkpoints_as_often_as_asked(scene, tmp_path, workers):
+    words = ["table:gradient", "--data", str(scene), "--steps", "4", "--rows", "1", "--out", str(tmp_path)]
+    assert main(["ablate", *words, "--probe", "0", "--checkpoint-every", "3", *workers]) == 0
+    (run,) = (tmp_path / "runs").iterdir()
+    lines = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
+    step, saved = 0, []
+    for line in lines:
+        step = line["index"] if line["event"] == "StepDone" else step
+        saved += [step] if line.get("what") == "checkpoint" else []
+    assert saved == [3, 4]
+
+
+def test_checkpoints_without_steps_between_are_refused(scene, tmp_path, capsys):
+    assert main(["ablate", "--data", str(scene), "--out", str(tmp_path / "t"), "--checkpoint-every", "0"]) == 2
+    assert "--checkpoint-every 0: give 1 or more steps" in capsys.readouterr().err
+
+
 def test_a_failing_row_is_exit_status_1(scene, monkeypatch, tmp_path, capsys):
     real = pipeline.run
 
