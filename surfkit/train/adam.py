@@ -102,30 +102,30 @@ def update(
         index: The step, from 1.
         first: Place in its column of the first value, for moments in 16 bits.
     """
-    tensors = (value, grad, exp_avg, exp_avg_sq)
-    if all(_is_gpu(t) for t in tensors):
-        launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index, first)
-        return
-    if native.module() is not None and all(map(_plain, tensors)) and is_short(exp_avg):
-        _update_short(value, None, None, grad, exp_avg, exp_avg_sq, rate, index, first)
-        return
-    if grad.numel() > VALUES_TOGETHER and (is_short(exp_avg) or not grad.is_contiguous()):
-        width = grad[0].numel()  # copies of some rows at a time hold less than those of all
-        for some in _pieces(len(grad), width):
+    width = value[:1].numel()
+    if grad.numel() > VALUES_TOGETHER and not grad.is_contiguous():
+        for some in _pieces(len(grad), width):  # copies of some rows at a time hold less than one of all
             update(value[some], grad[some], exp_avg[some], exp_avg_sq[some], rate, index, first + some.start * width)
         return
+    tensors = value, grad.contiguous(), exp_avg, exp_avg_sq
+    if all(map(_is_gpu, tensors)):
+        launch_update(kernels(ADAM_SOURCE, value.device), *tensors, rate, index, first)
+        return
+    is_compiled = native.module() is not None and all(map(_is_plain, tensors))
+    if is_short(exp_avg) and is_compiled:
+        _update_short(value, None, None, *tensors[1:], rate, index, first)
+        return
     if is_short(exp_avg):
-        moments = exp_avg.float(), exp_avg_sq.float()
-        update(value, grad, *moments, rate, index)
-        exp_avg.copy_(moments[0])
-        places = torch.arange(first, first + value.numel(), device=value.device)
-        exp_avg_sq.view(-1).copy_(dithered(moments[1].view(-1), places, index))
+        for some in _pieces(len(grad), width):
+            moments = exp_avg[some].float(), exp_avg_sq[some].float()
+            update(value[some], grad[some], *moments, rate, index)
+            exp_avg[some] = moments[0].to(SHORT)
+            places = first + some.start * width + torch.arange(moments[1].numel(), device=value.device)
+            exp_avg_sq[some] = dithered(moments[1].flatten(), places, index).view_as(moments[1])
         return
     rate, correction = _corrected(rate, index)
-    tensors = value, grad.contiguous(), exp_avg, exp_avg_sq
-    if native.module() is not None and all(map(_plain, tensors)):
-        numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
-        native.kernels().adam(*tensors, *numbers)
+    if is_compiled:
+        native.kernels().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
         return
     exp_avg.lerp_(grad, 1 - BETA1)
     exp_avg_sq.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
@@ -156,12 +156,12 @@ def update_rows(
     """
     grad = grad.contiguous()
     tensors = (value, kept, grad, exp_avg, exp_avg_sq)
-    if all(_is_gpu(t) for t in tensors):
+    if all(map(_is_gpu, tensors)):
         launch_update_rows(
             kernels(ADAM_SOURCE, value.device), value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index
         )
         return
-    if native.module() is not None and all(map(_plain, tensors)):
+    if native.module() is not None and all(map(_is_plain, tensors)):
         if is_short(exp_avg):
             _update_short(value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index)
             return
@@ -265,5 +265,5 @@ def _is_gpu(tensor: Tensor) -> bool:
     return tensor.device.type == "cuda" and tensor.dtype in (torch.float32, SHORT) and tensor.is_contiguous()
 
 
-def _plain(tensor: Tensor) -> bool:
+def _is_plain(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu" and tensor.dtype in (torch.float32, SHORT) and tensor.is_contiguous()
