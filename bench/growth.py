@@ -2,7 +2,7 @@
 
 Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
 many points in each view whatever the number of photographs. For each survey and each optimizer, a process of its own
-takes steps of 2DGS, without densification or, with --policies, between its edits. They are spread over all photographs:
+takes steps of 2DGS, without densification and between the edits of one. They are spread over all photographs:
 the median CPU time of a step, all threads, and the peak of the memory. Points are made at once, not read; photographs
 are noise, made when they are asked for, so that neither files nor the cache count.
 """
@@ -10,6 +10,7 @@ are noise, made when they are asked for, so that neither files nor the cache cou
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import subprocess
@@ -100,20 +101,20 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, nargs="+", default=[2000, 8000])
     parser.add_argument("--optimizers", nargs="+", default=["adam", "adam-in-view"])
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--policies", action="store_true", help="with the recipe's densification and pruning")
+    parser.add_argument("--policies", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
         print(json.dumps(measured(given.photographs[0], given.optimizers[0], given.steps, given.policies)))
         return
     figures = {}
-    for optimizer in given.optimizers:
-        for photographs in given.photographs:
-            words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--optimizers", optimizer]
-            words += ["--policies"] * given.policies
-            said = subprocess.run([*words, "--steps", str(given.steps)], stdout=subprocess.PIPE, text=True, check=True)
-            figures[f"{optimizer} {photographs}" + " policies" * given.policies] = found = json.loads(said.stdout)
-            print(optimizer, photographs, *(f"{name} {value:.4g}" for name, value in found.items()), flush=True)
+    for optimizer, photographs, policies in itertools.product(given.optimizers, given.photographs, (False, True)):
+        words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--optimizers", optimizer]
+        words += ["--policies"] * policies + ["--steps", str(given.steps)]
+        found = json.loads(subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True).stdout)
+        name = f"{optimizer} {photographs}" + " with policies" * policies
+        figures[name] = found
+        print(name, *(f"{part} {value:.4g}" for part, value in found.items()), flush=True)
     print(f"wrote {save('growth', figures)}")
 
 
