@@ -48,9 +48,9 @@ class MemoryMeter:
 
     def step(self, state: StageState, data: TrainingData, uploads: Uploads) -> None:
         """See what is held after a step."""
-        groups = (*vars(state.points).values(), state.frozen, state.appearances)
-        points = sum(value.nbytes for group in groups for value in group.values())
-        where = self.gpu if state.points.params["means"].is_cuda else self.parts
+        beside = sum(value.nbytes for group in (state.frozen, state.appearances) for value in group.values())
+        points = state.points.nbytes + beside
+        where = self.gpu if state.points.device.type == "cuda" else self.parts
         where["points"] = max(where["points"], points)
         self.gpu["photographs"] = max(self.gpu["photographs"], uploads.bytes)
         for name, count in data.bytes().items():
