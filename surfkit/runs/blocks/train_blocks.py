@@ -362,7 +362,9 @@ def job_of(ctx: RunContext, block: BlockRun, compute: Compute) -> Job:
         compute.device,
     ]
     command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
-    command += ["--gpu-cache", ctx.caches.gpu]
+    command += ["--gpu-cache", ctx.caches.gpu, "--points-on", ctx.caches.points.place]
+    if ctx.caches.points.scratch is not None:
+        command += ["--scratch", str(ctx.caches.points.scratch.resolve())]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
     command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
     command += ["--patience", f"{WORKER_PATIENCE_S}"] * elsewhere
