@@ -112,7 +112,7 @@ class Points:
             rows: (K,) int64 of these N points, or from N on of those that are added.
             added: Raw parameters of new points, (M, ...) each, whose moments and statistics are 0.
         """
-        count = len(self)
+        count, rows = len(self), rows.to(self.device)
         new = (rows >= count).nonzero()[:, 0] if added is not None else None
         there, which = (rows, None) if new is None else (rows.clamp_max(count - 1), rows[new] - count)
         for group in self.groups[:4]:
