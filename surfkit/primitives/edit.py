@@ -134,7 +134,8 @@ def apply_in_place(
     new = {name: torch.cat([rows[name] for rows in added]) for name in points.params} if added else None
     del added
     if keep is not None or new is not None or order is not None:
-        rows = torch.arange(len(points), device=points.device) if keep is None else keep.nonzero()[:, 0]
+        rows = torch.arange(len(points)) if keep is None else keep.nonzero()[:, 0]
+        rows = rows.to(points.device)
         means = points.params["means"][rows]
         if new is not None:
             means = torch.cat([means, new["means"]])
