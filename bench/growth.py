@@ -2,10 +2,10 @@
 
 Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
 many points in each view whatever the number of photographs. For each survey and each way to update, a process of its
-own takes steps of 2DGS, without densification or, with --policies, between its edits, spread over all photographs: the median CPU time of a step, all
-threads, and the peak of the memory; of the anonymous memory, which the system cannot put aside, the peak while steps are
-taken. Points are made at once, not read; photographs are noise, made when they are asked for, so that neither files nor
-the cache count. --points-on disk keeps the points in files in --scratch.
+own takes steps of 2DGS, without densification or, with --policies, between its edits, spread over all photographs: the
+median CPU time of a step, all threads, and the peak of the memory; of the anonymous memory, which the system cannot put
+aside, the peak while steps are taken. Points are made at once, not read; photographs are noise, made when they are
+asked for, so that neither files nor the cache count. --points-on disk keeps the points in files in --scratch.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import subprocess
 import re
+import subprocess
 import sys
 import threading
 import time

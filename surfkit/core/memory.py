@@ -104,7 +104,8 @@ def resident_bytes() -> int:
 
 
 def mapped_bytes() -> int:
-    """Of what is held, what is mapped from files: the system takes it back where it needs the memory. 0 where it is not known."""
+    """Of what is held, what is mapped from files, which the system takes back where it needs the memory; 0 where it is
+    not known."""
     with suppress(OSError):
         text = STATUS.read_text(encoding="ascii", errors="replace")
         return sum(int(found) * 1024 for found in MAPPED.findall(text))

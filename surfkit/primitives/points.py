@@ -96,7 +96,8 @@ class Points:
 
     def listed(self) -> Points:
         """The same columns, in lists of their own: to put others in their place does not change these points."""
-        return Points(*map(dict, self.groups), storage=self.storage)
+        params, first, second, stats, shared = map(dict, self.groups)
+        return Points(params, first, second, stats, shared, self.storage)
 
     def to_rearrange(self) -> Points:
         """What to rearrange in place of these points: on a GPU, whose memory may give out half-way, the same columns in
@@ -137,4 +138,5 @@ class Points:
                 for name, value in group.items()
             }
 
-        return Points(*map(moved, self.groups), storage=storage)
+        params, first, second, stats, shared = map(moved, self.groups)
+        return Points(params, first, second, stats, shared, storage)

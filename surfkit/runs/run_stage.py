@@ -333,9 +333,7 @@ def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable
     return draw
 
 
-def drawn_now(
-    trainer: Trainer, state: StageState, view: View, geometry: bool = True, distortion: bool = True
-) -> Maps:
+def drawn_now(trainer: Trainer, state: StageState, view: View, geometry: bool = True, distortion: bool = True) -> Maps:
     """Maps of a view with the points of a stage between two steps, and those that are frozen."""
     stage, primitive, camera, degree = trainer.stage, trainer.primitive, view.camera, state.sh_degree
     if why_all(stage, primitive) is None:

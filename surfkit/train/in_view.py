@@ -96,9 +96,7 @@ def shown_points(setup: StageSetup, state: StageState, camera: Camera, degree: i
     """(R,) rows of the points that a view may show; and these, where the rasterizer draws, in the colours that they
     leave the stage with, and then those of the frozen ones. For a stage with steps for the points in view."""
     blocks = blocks_of(setup, state)
-    in_view = PointsInView.of(
-        setup.primitive, state.points.params, camera, setup.rasterizer, setup.stage.near, blocks
-    )
+    in_view = PointsInView.of(setup.primitive, state.points.params, camera, setup.rasterizer, setup.stage.near, blocks)
     some = Points(on(setup.rasterizer.where(), in_view.of_columns(state.points.params)), {}, {})
     params = setup.stage.finished(replace(state, points=some))
     shape = setup.primitive.activate(params, degree)
@@ -111,8 +109,8 @@ def on(device: torch.device, columns: Columns) -> Columns:
 
 
 def why_all(stage: Stage, primitive: Primitive) -> str | None:
-    """What lets steps of a stage be for all points, by its name in the stage, and what to do; None where all are for the
-    points in view."""
+    """What lets steps of a stage be for all points, by its name in the stage, and what to do; None where all steps are
+    for the points in view."""
     if stage.update != "in-view":
         return f"update is {stage.update}; set it to in-view"
     if stage.regularizers:

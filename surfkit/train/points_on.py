@@ -39,7 +39,8 @@ class PointsOn:
     scratch: Path | None = None
 
     def refuse_unfit(self, stages: Iterable[tuple[str, Stage, Primitive]]) -> None:
-        """BadInput where points cannot be kept there; stages by their path in the recipe, with what their points are."""
+        """BadInput where points cannot be kept there; stages with their path in the recipe, and what their points
+        are."""
         if self.scratch is not None:
             if self.place in ("device", "host"):
                 raise BadInput(
@@ -54,8 +55,8 @@ class PointsOn:
         for path, stage, primitive in stages:
             if why := why_all(stage, primitive):
                 raise BadInput(
-                    f"--points-on {self.place} is for stages whose steps need only the points in view, and {path}.{why}, "
-                    "or use --points-on auto"
+                    f"--points-on {self.place} is for stages whose steps need only the points in view, and "
+                    f"{path}.{why}, or use --points-on auto"
                 )
 
     def home(self, folder: Path) -> Storage | None:
@@ -69,7 +70,7 @@ class PointsOn:
         folder = self.scratch or folder
         folder.mkdir(parents=True, exist_ok=True)
         if (kind := _file_system(folder)) in IN_MEMORY:
-            emit(Warned(f"{folder} is in memory ({kind}), so points in it save none; --scratch names a folder on a disk"))
+            emit(Warned(f"{folder} is in memory ({kind}), so points there save none; name another with --scratch"))
         return DiskStorage(folder=folder)
 
     def next_place(self, now: Storage, stage: Stage, primitive: Primitive) -> Place | None:

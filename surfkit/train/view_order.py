@@ -63,7 +63,7 @@ class ViewContributions:
         """See `Views.each`."""
         for shown, amount, count in self.shown(alpha_power, transmittance_power):
             if not isinstance(shown, slice):
-                amount, count = (v.new_zeros(self.rows).index_copy_(0, shown, v) for v in (amount, count))
+                amount, count = (v.new_zeros(self._told(v)).index_copy_(0, shown, v) for v in (amount, count))
             yield amount, count
 
     def shown(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor | slice, Tensor, Tensor]]:
@@ -96,6 +96,10 @@ class ViewContributions:
 
     def _nothing(self, amount: Tensor) -> Contribution:
         """What no view tells, where the amounts of one lie."""
-        told = len(amount) if self.of_view is None else self.rows
+        told = self._told(amount)
         zeros = (amount.new_zeros(told, dtype=kind) for kind in (amount.dtype, amount.dtype, torch.int64, torch.int64))
         return Contribution(*zeros)
+
+    def _told(self, amount: Tensor) -> int:
+        """Of how many it tells, given the amounts of a view."""
+        return len(amount) if self.rows is None else self.rows

@@ -1,30 +1,48 @@
-"""Whole runs whose points are kept elsewhere than where they are drawn, from the begin or from where memory gave out."""
+"""Whole runs whose points are kept in files: the same bits, also where a run goes on elsewhere or memory gives out."""
 
 import json
 import os
 from dataclasses import replace
 
 import pytest
-from test_gpu_run import EVERY, cloud, data, during, gpu, notes, recipe  # noqa: F401  (fixtures)
+import torch
+from test_gpu_run import EVERY, STEPS, cloud, during, notes
 
+from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.tree import evolve
 from surfkit.io.datasets.data import Data
 from surfkit.primitives.storage import DiskStorage
 from surfkit.runs import run_stage
 from surfkit.runs.pipeline import run
+from surfkit.runs.recipe import with_steps
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.points_on import PointsOn
 
 
 @pytest.fixture(scope="module")
-def in_view(recipe):  # noqa: F811
+def data(tmp_path_factory) -> Data:
+    torch.set_num_threads(2)
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(width=48, height=36, points=200)))
+    return Data(folder)
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    small = evolve(with_steps(recipes()["2dgs"], STEPS), "primitive.sh_degree", 1)
+    return replace(evolve(evolve(small, "pretrain.densify.every", 5), "pretrain.densify.start", 4), mesh=None)
+
+
+@pytest.fixture(scope="module")
+def in_view(recipe):
     return evolve(recipe, "pretrain.update", "in-view")
 
 
 @pytest.fixture(scope="module")
-def whole(in_view, data, tmp_path_factory):  # noqa: F811
+def whole(in_view, data, tmp_path_factory):
     """The cloud of a run whose points are in memory."""
     out = tmp_path_factory.mktemp("whole") / "run"
     run(in_view, data, out, intervals=EVERY, caches=on("device"))
@@ -53,7 +71,12 @@ def record(out):
 
 
 def test_same_bits_on_the_disk_also_of_a_run_that_goes_on_elsewhere(
-    in_view, data, whole, tmp_path, storages, monkeypatch  # noqa: F811
+    in_view,
+    data,
+    whole,
+    tmp_path,
+    storages,
+    monkeypatch,
 ):
     out, scratch = tmp_path / "run", tmp_path / "scratch"
     scratch.mkdir()
@@ -76,7 +99,11 @@ def test_same_bits_on_the_disk_also_of_a_run_that_goes_on_elsewhere(
 
 
 def test_a_full_disk_ends_the_run_in_one_line_and_the_same_command_goes_on(
-    in_view, data, whole, tmp_path, monkeypatch  # noqa: F811
+    in_view,
+    data,
+    whole,
+    tmp_path,
+    monkeypatch,
 ):
     out = tmp_path / "run"
 
@@ -85,7 +112,7 @@ def test_a_full_disk_ends_the_run_in_one_line_and_the_same_command_goes_on(
 
     with monkeypatch.context() as patch:
         during(patch, "densify", 5, lambda: patch.setattr(os, "posix_fallocate", full))
-        with pytest.raises(Fault, match=r"run/pretrain: the disk is full .*last checkpoint in .* is whole: free some") as fault:
+        with pytest.raises(Fault, match="run/pretrain: the disk is full .*last checkpoint in .* is whole") as fault:
             run(in_view, data, out, intervals=replace(EVERY, checkpoint=4), caches=on("disk"))
     assert fault.value.kind == "disk" and "\n" not in str(fault.value)
     run(in_view, data, out, intervals=EVERY, caches=on("disk"))
@@ -93,7 +120,12 @@ def test_a_full_disk_ends_the_run_in_one_line_and_the_same_command_goes_on(
 
 
 def test_auto_keeps_them_on_the_disk_when_memory_is_short(
-    in_view, data, whole, tmp_path, storages, monkeypatch  # noqa: F811
+    in_view,
+    data,
+    whole,
+    tmp_path,
+    storages,
+    monkeypatch,
 ):
     free = iter([10**6] * 3 + [10**12] * 100)
     monkeypatch.setattr(run_stage, "free_bytes", lambda: next(free))
@@ -105,29 +137,7 @@ def test_auto_keeps_them_on_the_disk_when_memory_is_short(
     assert cloud(out) == whole and record(out)["points_on"] == "auto"
 
 
-def test_auto_keeps_them_on_the_host_when_the_gpu_is_full(
-    gpu, in_view, data, tmp_path, storages, monkeypatch  # noqa: F811
-):
-    """The state after the last step is kept, and the run goes on from there."""
-    next_home = run_stage.next_home
-
-    def full():
-        if not notes(out):
-            gpu.limit = gpu.held + 20_000
-
-    def more_room(*given):
-        gpu.limit = None
-        return next_home(*given)
-
-    during(monkeypatch, "view_gradients", 14, full)
-    monkeypatch.setattr(run_stage, "next_home", more_room)
-    out = tmp_path / "run"
-    run(in_view, data, out, intervals=EVERY, caches=replace(on("auto"), gpu="0"))
-    assert [text for text in notes(out) if "step 14: the memory of the GPU gave out; points are kept in the mem" in text]
-    assert storages[-1].device.type == "cpu" and not isinstance(storages[-1], DiskStorage)
-
-
-def test_a_recipe_whose_steps_need_all_points_is_refused_before_anything_is_written(recipe, data, tmp_path):  # noqa: F811
+def test_a_recipe_whose_steps_need_all_points_is_refused_before_anything_is_written(recipe, data, tmp_path):
     with pytest.raises(BadInput, match="^--points-on disk .* pretrain.update is all; set it to in-view"):
         run(recipe, data, tmp_path / "run", caches=on("disk"))
     assert not (tmp_path / "run").exists()

@@ -253,8 +253,8 @@ def _memory(found: ResourceEstimate) -> list[Finding]:
         left = rest - found.movable_bytes + MIN_CACHE_BYTES
         if found.gpu is None and left <= free and _fits_disk(found):
             text += (
-                f"; --points-on disk{least} takes at most {size(left)} of memory and {size(found.movable_bytes)} of the "
-                "disk, with the same result"
+                f"; --points-on disk{least} takes at most {size(left)} of memory and {size(found.movable_bytes)} of "
+                "the disk, with the same result"
             )
     return [Finding("warning", "memory", text)]
 

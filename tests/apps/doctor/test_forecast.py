@@ -345,7 +345,11 @@ def test_what_to_lower_where_a_gpu_is_small(free, words):
 @pytest.mark.parametrize(
     "memory, disk, words",
     [
-        (5 * 10**9, 10**12, "; --points-on disk with --cache 200MB takes at most 3.8 GB of memory and 1.4 GB of the disk"),
+        (
+            5 * 10**9,
+            10**12,
+            "; --points-on disk with --cache 200MB takes at most 3.8 GB of memory and 1.4 GB of",
+        ),
         (5 * 10**9, 4 * 10**9, None),  # the run folder takes 3.3 GB of it
         (4 * 10**9, 10**12, None),
         (9_500_000_000, 10**12, None),  # a smaller cache will do
@@ -362,7 +366,12 @@ def test_points_in_files_where_memory_is_short(memory, disk, words):
 @pytest.mark.parametrize(
     "free, memory, disk, words",
     [
-        (8 * 10**9, 10**12, 10**12, "; --points-on host leaves at most 6.6 GB there, and takes 1.4 GB of the memory of"),
+        (
+            8 * 10**9,
+            10**12,
+            10**12,
+            "; --points-on host leaves at most 6.6 GB there, and takes 1.4 GB of the memory",
+        ),
         (8 * 10**9, 25 * 10**8, 10**12, "; --points-on disk leaves at most 6.6 GB there, and takes 1.4 GB of the disk"),
         (8 * 10**9, 25 * 10**8, 4 * 10**9, None),
         (5 * 10**9, 10**12, 10**12, None),
