@@ -6,7 +6,6 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -127,7 +126,10 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
     Then, if the stage allows it, with its points elsewhere (`PointsOn`).
     """
     trainer, along = trainer_of(job), pictures_of(job)
-    fresh = partial(begin, job, trainer)
+
+    def fresh() -> StageState:
+        return begin(job, trainer)
+
     if state is not None:
         say(f"{job.stage.out}: going on after step {state.index} of {job.stage.stage.steps}")
     state = state or fresh()

@@ -13,7 +13,7 @@ from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
-from surfkit.train.in_view import shown_points, with_frozen
+from surfkit.train.in_view import shown_points
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step_result import StepResult
@@ -39,7 +39,7 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
 
     @cache
     def drawn() -> Splats:
-        return result.splats if in_view is None else with_frozen(setup, state, all_splats(setup, state), 0)
+        return result.splats if in_view is None else all_splats(setup, state)
 
     def of_all(name: str) -> Callable[[], Tensor]:
         return lambda: getattr(shown, name) if in_view is None else in_view.among_all(getattr(shown, name))

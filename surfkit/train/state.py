@@ -51,7 +51,7 @@ class StageState:
         where the points are kept, if not there."""
         home = home or Storage(device)
         if self.points.storage != home:
-            self.points = self.points.to(home)
+            self.points, self.blocks = self.points.to(home), None  # which hold the columns
             self.frozen = {name: home.held(value) for name, value in self.frozen.items()}
         self.appearances = {n: v.to(device) if v.is_floating_point() else v for n, v in self.appearances.items()}
 
