@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.schedule import LearningRate
 from surfkit.densify import ADC, Trim
 from surfkit.densify.base import Prune
 from surfkit.losses.regularizers import MeanOpacity
@@ -131,6 +132,22 @@ def test_points_on_the_host_while_a_gpu_draws(apart):
     assert len(ends[0]) == len(ends[1]) > 60 and peaks[1] < peaks[0]
     for name, value in ends[0].params.items():
         torch.testing.assert_close(ends[1].params[name], value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("within", [8, 14, 20])
+def test_points_stay_in_one_order_where_the_gpu_is_full_while_they_are_put_in_order(apart, within):
+    """Half of the columns in another order would be other points."""
+    stage, ends = replace(EDITS, densify=None, prune=(), rates={"means": LearningRate(0.1)}), []
+    for fails in (False, True):
+        with simulated_gpu() as gpu:
+            trainer, state = apart(stage=stage, rasterizer=OnSimulatedGpu(apart()[0].rasterizer))
+            for done in trainer.run(state):
+                if fails and done.index == 5:  # the next step puts them in order
+                    gpu.refused = {gpu.allocations + within}
+            assert not fails or gpu.allocations > max(gpu.refused)
+            state.move(torch.device("cpu"))
+        ends.append(state.points)
+    same(*ends)
 
 
 def test_a_full_disk_is_an_error_that_names_the_folder(apart, tmp_path, monkeypatch):

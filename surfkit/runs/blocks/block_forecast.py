@@ -24,7 +24,7 @@ TRAINED_POINT_BYTES, FROZEN_POINT_BYTES = 3_000, 1_500
 """Memory of a point: with parameters, moments, gradients and buffers of the rasterizer; and of a frozen one, without
 moments and gradients. Measured at 1,640 and 770 for each additional point; about as much again is for tiles."""
 FILED_POINT_BYTES = 300
-"""Memory of a point that is kept in a file: what an edit takes, measured at 140, and about as much for what views show."""
+"""Memory of a point that is kept in a file: what an edit takes, measured at 140, and as much for what views show."""
 FROZEN_TIME_SHARE = 0.75
 """Time of a frozen point in a step, as a share of that of another (measured: 0.78 ms to 1.03 ms for 1,000 points)."""
 
