@@ -29,7 +29,6 @@ from surfkit.runs.context import RunContext
 from surfkit.runs.ensure_depth_maps import with_maps, with_maps_to_mesh
 from surfkit.runs.folder import (
     Run,
-    RunStage,
     discard_results,
     read_data,
     refuse_file,
@@ -207,19 +206,11 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     refuse_unused(run.recipe)
     refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
-    caches.points.refuse_unfit((at.setting, at.stage, at.primitive) for at in optimised_stages(run))
+    caches.points.refuse_unfit((at.setting, at.stage, at.primitive) for at in run.optimised_stages())
     if run.recipe.partition is not None:
         compute.workers.ready()
     for mesher in run.recipe.meshers:
         mesher.ready()
-
-
-def optimised_stages(run: Run) -> Iterator[RunStage]:
-    """The stages that the recipe has optimised, also that of the model that decides the partition."""
-    if run.recipe.has_stages:
-        yield from run.stages
-        if run.partition is not None:
-            yield replace(run.partition.pretrain, setting="partition_pretrain")
 
 
 def refuse_unsaved(recipe: Recipe) -> None:

@@ -18,7 +18,7 @@ from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.primitives.storage import DiskStorage, Storage
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
-from surfkit.train import checkpoint, in_view, point_blocks
+from surfkit.train import checkpoint, in_view, point_blocks, points_on
 from surfkit.train.points_on import PointsOn
 from surfkit.train.stage import Stage
 
@@ -206,3 +206,27 @@ def test_scratch_needs_files_and_a_folder(tmp_path):
     with pytest.raises(BadInput, match="^--scratch .*no such folder"):
         PointsOn("disk", tmp_path / "none").refuse_unfit([])
     PointsOn("disk", tmp_path).refuse_unfit([])
+
+
+def test_files_that_take_memory_are_warned_of(tmp_path, monkeypatch):
+    """The folder of a stage is made, and a disk is taken without a word."""
+    told = []
+    monkeypatch.setattr(points_on, "emit", lambda event: told.append(event.text))
+    for kind, count in (("ext4", 0), ("tmpfs", 1)):
+        monkeypatch.setattr(points_on, "_file_system", lambda folder, kind=kind: kind)
+        assert PointsOn("disk").home(tmp_path / "stage") == DiskStorage(folder=tmp_path / "stage")
+        assert len(told) == count
+    assert "(tmpfs)" in told[0] and "--scratch" in told[0]
+    assert PointsOn("auto").home(tmp_path) is None and PointsOn("device").home(tmp_path) is None
+    assert PointsOn("host").home(tmp_path) == Storage(torch.device("cpu"))
+
+
+def test_where_points_go_when_memory_is_full():
+    """One place after the other, with auto alone, and where the steps of a stage are for points in view."""
+    places = Storage(torch.device("cuda")), Storage(torch.device("cpu")), DiskStorage()
+    given = EDITS, Surfel2D()
+    assert [PointsOn("auto").next_place(each, *given) for each in places] == ["host", "disk", None]
+    assert [PointsOn("device").next_place(each, *given) for each in places] == [None] * 3
+    assert [PointsOn("auto").next_place(each, replace(EDITS, update="all"), Surfel2D()) for each in places] == [
+        None
+    ] * 3
