@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import psutil
 import torch
@@ -37,6 +37,10 @@ class PointsOn:
 
     place: Place = "auto"
     scratch: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.place not in get_args(Place):
+            raise BadInput(f"points_on {self.place!r}: give one of {', '.join(get_args(Place))}")
 
     def refuse_unfit(self, stages: Iterable[tuple[str, Stage, Primitive]]) -> None:
         """BadInput where points cannot be kept there; stages with their path in the recipe, and what their points

@@ -199,6 +199,12 @@ def test_stages_whose_steps_need_all_points_are_refused(change, named, place):
     PointsOn(place).refuse_unfit([("pretrain", EDITS, Surfel2D())])
 
 
+def test_an_unknown_place_is_refused():
+    """As from Python, where no command line is parsed."""
+    with pytest.raises(BadInput, match="^points_on 'disc': give one of auto, device, host, disk$"):
+        PointsOn("disc")
+
+
 def test_scratch_needs_files_and_a_folder(tmp_path):
     for place in ("device", "host"):
         with pytest.raises(BadInput, match=f"^--scratch .*--points-on {place}"):
