@@ -2,9 +2,10 @@
 
 Made-up surveys of flat ground: photographs of 160 x 120 px in rows, so that each point is in about 25 of them, and as
 many points in each view whatever the number of photographs. For each survey and each optimizer, a process of its own
-takes steps of 2DGS, without densification and between the edits of one. They are spread over all photographs:
-the median CPU time of a step, all threads, and the peak of the memory. Points are made at once, not read; photographs
-are noise, made when they are asked for, so that neither files nor the cache count.
+takes steps of 2DGS, without densification and between the edits of one. They are spread over all photographs: the
+median CPU time of a step, all threads, and the peak of the memory; of the anonymous memory, which the system cannot put
+aside, the peak while steps are taken. Points are made at once, not read; photographs are noise, made when they are
+asked for, so that neither files nor the cache count. --points-on disk keeps the points in files in --scratch.
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ import argparse
 import itertools
 import json
 import math
+import re
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +28,7 @@ import torch
 from machine import save
 from torch import Tensor
 
-from surfkit.core.memory import peak_memory_bytes
+from surfkit.core.memory import give_back, peak_memory_bytes
 from surfkit.core.registry import find
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
@@ -32,6 +36,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View
 from surfkit.study.recipes import SURFELS
 from surfkit.train.optimizer import Optimizer
+from surfkit.train.points_on import PointsOn
 from surfkit.train.trainer import Trainer
 
 POINTS_PER_PHOTOGRAPH = 198
@@ -72,26 +77,57 @@ def survey(photographs: int) -> tuple[tuple[View, ...], SparsePoints]:
     return tuple(views), SparsePoints(xyz, rgb, size=torch.full((count,), 0.5 * 2 / math.sqrt(count)))
 
 
-def measured(photographs: int, optimizer: str, steps: int, policies: bool) -> dict[str, float]:
-    """Median CPU milliseconds of a step, and the peak of this process."""
+@contextmanager
+def watched(every_s: float = 0.005) -> Iterator[list[int]]:
+    """Within, the anonymous memory of this process is looked at every so often: the bytes held."""
+    found, over = [], threading.Event()
+
+    def look() -> None:
+        while not over.is_set():
+            text = Path("/proc/self/status").read_text()
+            found.append(1024 * int(re.search(r"RssAnon:\s*(\d+)", text)[1]))
+            over.wait(every_s)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield found
+    finally:
+        over.set()
+        thread.join()
+
+
+def measured(
+    photographs: int, optimizer: str, steps: int, policies: bool, place: str, scratch: Path | None
+) -> dict[str, float]:
+    """Median CPU milliseconds of a step, and the peaks of this process."""
     views, cloud = survey(photographs)
     stage = replace(SURFELS.pretrain, steps=30_000, optimizer=find(Optimizer, optimizer)())
     stage = stage if policies else replace(stage, densify=None, prune=())
     rasterizer, _ = select("cpu")
-    trainer = Trainer(stage, SURFELS.primitive, views, Noise(photographs), rasterizer)
+    home = PointsOn(place, scratch).home(Path())
+    trainer = Trainer(stage, SURFELS.primitive, views, Noise(photographs), rasterizer, home=home)
     generator = torch.Generator().manual_seed(0)
-    state = trainer.begin(Points.fresh(SURFELS.primitive.init(cloud, generator)), generator)
-    times, seen = [], []
-    for index in range(steps + 5):
-        began = time.process_time()
-        done = trainer.step(state)
-        times += [1e3 * (time.process_time() - began)] * (index >= 5)
-        seen.append(float(done.maps.need("alpha").mean()))
+    state = trainer.begin(Points.fresh(SURFELS.primitive.init(cloud, generator), storage=home), generator)
+    del cloud
+    give_back()
+    times, walls, seen = [], [], []
+    with watched() as anonymous:
+        for index in range(steps + 5):
+            began, clock = time.process_time(), time.perf_counter()
+            done = trainer.step(state)
+            times += [1e3 * (time.process_time() - began)] * (index >= 5)
+            walls += [1e3 * (time.perf_counter() - clock)] * (index >= 5)
+            seen.append(float(done.maps.need("alpha").mean()))
     return {
         "ms": sorted(times)[len(times) // 2],
         "mean_ms": sum(times) / len(times),
+        "wall_ms": sorted(walls)[len(walls) // 2],
+        "mean_wall_ms": sum(walls) / len(walls),
         "points": len(state.points),
         "peak_gb": peak_memory_bytes() / 1e9,
+        "anonymous_gb": max(anonymous) / 1e9,
+        "points_gb": state.points.nbytes / 1e9,
         "alpha": sum(seen) / len(seen),
     }
 
@@ -101,18 +137,22 @@ def main() -> None:
     parser.add_argument("--photographs", type=int, nargs="+", default=[2000, 8000])
     parser.add_argument("--optimizers", nargs="+", default=["adam", "adam-in-view"])
     parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--points-on", default="device", choices=["device", "disk"])
+    parser.add_argument("--scratch", type=Path, default=Path())
     parser.add_argument("--policies", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
-        print(json.dumps(measured(given.photographs[0], given.optimizers[0], given.steps, given.policies)))
+        where = given.points_on, given.scratch if given.points_on == "disk" else None
+        print(json.dumps(measured(given.photographs[0], given.optimizers[0], given.steps, given.policies, *where)))
         return
     figures = {}
     for optimizer, photographs, policies in itertools.product(given.optimizers, given.photographs, (False, True)):
         words = [sys.executable, __file__, "--one", "--photographs", str(photographs), "--optimizers", optimizer]
         words += ["--policies"] * policies + ["--steps", str(given.steps)]
+        words += ["--points-on", given.points_on, "--scratch", str(given.scratch)]
         found = json.loads(subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True).stdout)
-        name = f"{optimizer} {photographs}" + " with policies" * policies
+        name = f"{optimizer} {photographs}" + " with policies" * policies + " disk" * (given.points_on == "disk")
         figures[name] = found
         print(name, *(f"{part} {value:.4g}" for part, value in found.items()), flush=True)
     print(f"wrote {save('growth', figures)}")

@@ -1,12 +1,13 @@
 """Kills a training run at random moments until it is done, and compares its end with that of an undisturbed one.
 
-    python bench/kill.py [--kills 20] [--seed 0] [--blocks] [--out kill.json]
+    python bench/kill.py [--kills 20] [--seed 0] [--blocks] [--disk] [--out kill.json]
 
 Every attempt is a process of its own that runs the command line. It ends by SIGKILL after a random time, at a random
 file operation inside the run folder (open, rename, remove, make a folder, before or after a flush to the disk), or in
 the middle of writing a checkpoint, of which a random part is then on the disk. The same command goes on from there.
 The comparison is of every byte of the points, of the optimiser's state, of the random generator and of the journal's
-list of steps. With --blocks, the run is one in two blocks, and each of them is compared too.
+list of steps. With --blocks, the run is one in two blocks, and each of them is compared too. With --disk, the runs that
+are killed keep their points in files, and the other one in memory.
 Exits 1 if anything differs.
 """
 
@@ -30,6 +31,7 @@ from pathlib import Path
 STEPS = 24
 WORDS = f"train recipe:2dgs --steps {STEPS} --checkpoint-every 7 --pictures-every 20 --device cpu"
 SETTINGS = "--primitive.sh-degree 1 --pretrain.densify.every 5 --pretrain.densify.start 10"
+DISK = "pretrain.optimizer:adam-in-view"
 BLOCKS = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share --tune.sh-every 1"
 KINDS = ("time", "operation", "torn")
 
@@ -157,6 +159,7 @@ class Kills:
     folder: Path
     draw: random.Random
     more: str = ""
+    where: str = ""
     wanted: dict[str, str] = field(default_factory=dict)
     operations: int = 0
     seconds: float = 0.0
@@ -164,9 +167,10 @@ class Kills:
     runs: int = 0
     differing: list[str] = field(default_factory=list)
 
-    def words(self, out: Path) -> list[str]:
+    def words(self, out: Path, where: str | None = None) -> list[str]:
         """The command line of a run."""
-        return [*f"{WORDS} {SETTINGS} {self.more}".split(), "--data", str(self.data), "--out", str(out)]
+        given = f"{WORDS} {SETTINGS} {self.more} {self.where if where is None else where}"
+        return [*given.split(), "--data", str(self.data), "--out", str(out)]
 
     def undisturbed(self) -> None:
         """Run once without a kill: what must come out, how long it takes, and how many file operations it has."""
@@ -183,7 +187,7 @@ class Kills:
 
             os._exit = noted
 
-        if attempt(self.words(out), prepare) != 0:
+        if attempt(self.words(out, where=""), prepare) != 0:
             raise SystemExit("the undisturbed run failed; KILL_SHOW=1 shows why")
         self.seconds, self.operations = time.perf_counter() - start, int(count.read_text())
         self.wanted = digests(out)
@@ -209,7 +213,7 @@ class Kills:
         if kind == "time":
             after = self.draw.uniform(0, 0.8 * self.seconds)
             return attempt(self.words(out), lambda: None, after), kind, after
-        at = self.draw.randint(1, self.operations * 4 // 5 if kind == "operation" else 12 if self.more else 4)
+        at = self.draw.randint(1, self.operations * 4 // 5 if kind == "operation" else 12 if self.more == BLOCKS else 4)
         deadly = Deadly(out, at) if kind == "operation" else Deadly(out, torn=at, share=self.draw.random())
         return attempt(self.words(out), deadly.install), kind, at
 
@@ -229,6 +233,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--blocks", action="store_true")
+    parser.add_argument("--disk", action="store_true", help="runs that are killed keep their points in files")
     parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
     os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
@@ -239,7 +244,8 @@ def main() -> int:
         data = Path(folder) / "data"
         flight = Flight(width=48, height=36, points=200)
         write_colmap(data, photograph(flight))
-        job = Kills(data, Path(folder), random.Random(chosen.seed), BLOCKS if chosen.blocks else "")
+        more, where = BLOCKS if chosen.blocks else DISK * chosen.disk, "--points-on disk" * chosen.disk
+        job = Kills(data, Path(folder), random.Random(chosen.seed), more, where)
         job.undisturbed()
         job.disturbed(chosen.kills)
     report = {

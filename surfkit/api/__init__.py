@@ -21,6 +21,7 @@ from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.recipe import Recipe, complete, with_steps
 from surfkit.train.data_cache import CacheSettings
+from surfkit.train.points_on import Place, PointsOn
 from surfkit.train.stage import Stage
 
 __all__ = ["Dataset", "Figures", "OnStep", "RunMesh", "TrainedRun", "get_recipe", "open_run", "read", "train"]
@@ -54,6 +55,8 @@ def train(
     device: Device = "auto",
     on_step: OnStep | None = None,
     cache: str = "auto",
+    points_on: Place = "auto",
+    scratch: str | Path | None = None,
 ) -> TrainedRun:
     """Train, and make the mesh if the recipe has one; a run that was interrupted goes on where it stopped.
 
@@ -66,6 +69,8 @@ def train(
         device: For training and drawing: "auto", "cpu", "cuda", "cuda:1", or a rasterizer by its name.
         on_step: Called after each step.
         cache: Memory for photographs, such as "4GB".
+        points_on: Where points are kept: "device" (where they are drawn), "host" or "disk", as `surfkit train` has it.
+        scratch: Folder for the files of points that are kept on the disk; by default the run folder.
 
     Raises:
         BadInput: Wrong settings or data, or `out` holds another run.
@@ -80,5 +85,6 @@ def train(
             say(f"steps: {steps:,}, as there are {count:,} photographs to train on; steps= changes it")
     chosen = chosen if steps is None else with_steps(chosen, steps)
     with listening(on_step):
-        pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache))
+        points = PointsOn(points_on, None if scratch is None else Path(scratch))
+        pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache, points=points))
     return open_run(out, device=device)

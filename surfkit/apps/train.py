@@ -32,6 +32,7 @@ from surfkit.runs.recipe import Recipe, unused, with_steps
 from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals
 from surfkit.study.tensorboard import tensorboard
 from surfkit.train.data_cache import CacheSettings
+from surfkit.train.points_on import Place, PointsOn
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
@@ -117,6 +118,15 @@ class TrainCommand:
     """Memory of the GPU for them, where there is one; auto is a quarter of what is free on it. It does not change the
     result. When the GPU is out of memory, nothing is kept there any more."""
 
+    points_on: Place = "auto"
+    """Where points are kept, with the moments of the optimiser: where they are drawn (device), in the memory of the CPU
+    (host), or in files on the disk (disk), of which the memory holds what views show. host and disk need stages that
+    update only points in view (`pretrain.optimizer:adam-in-view`). auto is device; when its memory is full, host, and
+    when that is full, disk, if the stage allows it."""
+
+    scratch: Path | None = None
+    """Folder for the files of points, best on a fast disk of this machine. Default: the run folder."""
+
     resized_copies: bool = False
     """Also keep photographs that do not fit into the cache on disk, decoded and resized, in DATA/resized. It saves time
     when large photographs are used at a much smaller size. It does not change the result."""
@@ -188,9 +198,8 @@ class TrainCommand:
             recipe = with_steps(self.recipe, self.steps)
         with following(out), tensorboard(out) if self.tensorboard else nullcontext():
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
-            caches = CacheSettings(
-                self.cache, self.resized_copies, None if self.no_prepare else self.prepare_cache, self.gpu_cache
-            )
+            maps, points = None if self.no_prepare else self.prepare_cache, PointsOn(self.points_on, self.scratch)
+            caches = CacheSettings(self.cache, self.resized_copies, maps, self.gpu_cache, points)
             metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
         print()

@@ -22,6 +22,7 @@ from surfkit.runs.run_stage import CHECKPOINT_EVERY, Intervals, select_rasterize
 from surfkit.study.tensorboard import tensorboard
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.faults import in_one_line
+from surfkit.train.points_on import Place, PointsOn
 from surfkit.train.progress_bars import bars
 
 
@@ -49,6 +50,12 @@ class TrainBlockCommand:
     gpu_cache: str = "auto"
     """Memory of the GPU for them; auto is a quarter of what is free on it."""
 
+    points_on: Place = "auto"
+    """Where points are kept, as for `surfkit train`: device, host or disk; auto is the first that has room."""
+
+    scratch: Path | None = None
+    """Folder for the files of points. Default: the folder of the block."""
+
     resized_copies: bool = False
     """Also keep photographs that do not fit into the cache on disk, at the size at which they are used."""
 
@@ -73,8 +80,10 @@ class TrainBlockCommand:
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:
             raise BadInput(f"block {self.block} has no views; it stays as it is in the coarse model")
-        caches = CacheSettings(self.cache, self.resized_copies, gpu=self.gpu_cache)
+        points = PointsOn(self.points_on, self.scratch)
+        caches = CacheSettings(self.cache, self.resized_copies, gpu=self.gpu_cache, points=points)
         caches.bytes()
+        points.refuse_unfit([("tune", run.recipe.tune, run.recipe.primitive)])
         intervals = Intervals(self.checkpoint_every, 0)
         scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
         with scalars, collect_notes(), in_one_line(self.run_folder), bars():

@@ -23,6 +23,7 @@ CAPACITY = re.compile(r"total capacity of ([\d.]+ \w+)")
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 """What Linux tells of this process, and where it is asked to count its peak anew."""
 PEAK = re.compile(r"^VmHWM:\s*(\d+) kB", re.MULTILINE)
+MAPPED = re.compile(r"^Rss(?:File|Shmem):\s*(\d+) kB", re.MULTILINE)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -100,6 +101,15 @@ def resident_bytes() -> int:
     import psutil
 
     return psutil.Process().memory_info().rss
+
+
+def mapped_bytes() -> int:
+    """Of what is held, what is mapped from files, which the system takes back where it needs the memory; 0 where it is
+    not known."""
+    with suppress(OSError):
+        text = STATUS.read_text(encoding="ascii", errors="replace")
+        return sum(int(found) * 1024 for found in MAPPED.findall(text))
+    return 0
 
 
 def give_back() -> None:

@@ -85,7 +85,10 @@ def drawn_by(primitive: Primitive, rasterizer: Rasterizer) -> Rasterizer:
     """What draws the splats of a primitive: `rasterizer`, through the primitive where that draws in its own way."""
     if isinstance(rasterizer, PrimitiveRasterizer):
         rasterizer = rasterizer.inner
-    own = type(primitive)
-    if all(getattr(own, name) is getattr(Primitive, name) for name in ("render", "contribution", "opacity_before")):
-        return rasterizer
-    return PrimitiveRasterizer(primitive, rasterizer)
+    return PrimitiveRasterizer(primitive, rasterizer) if draws_itself(primitive) else rasterizer
+
+
+def draws_itself(primitive: Primitive) -> bool:
+    """Whether a primitive draws its splats in its own way."""
+    own, ways = type(primitive), ("render", "contribution", "opacity_before")
+    return any(getattr(own, name) is not getattr(Primitive, name) for name in ways)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -91,7 +91,32 @@ ROW_FIELDS: dict[str, tuple[tuple[torch.dtype, ...], tuple[int, ...]]] = {
 
 def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Generator) -> Points:
     """Points after an edit: the kept in their order, then clones, children and new points."""
-    points, added, keep = _adjusted(primitive, points, edit), [], None
+    edited = points.listed()
+    apply_in_place(primitive, edited, edit, generator)
+    return edited
+
+
+def apply_in_place(
+    primitive: Primitive,
+    points: Points,
+    edit: Edit,
+    generator: torch.Generator,
+    order: Callable[[Tensor], Tensor] | None = None,
+) -> None:
+    """Edit points in place, one column after the other, as `apply` does.
+
+    Beside the points and the edit, this takes the new points, 8 bytes for each point there will be, and the largest
+    column once more; where the edit moves, dims, scales or forgets, also the columns that this changes.
+
+    Args:
+        primitive: What the points are.
+        points: If this fails, they are neither what they were nor what they should be.
+        edit: The change.
+        generator: Of random draws.
+        order: Gives the order that all are put in, (K,) indices, from their positions (K, 3).
+    """
+    _adjust(primitive, points, edit)
+    added, keep = [], None
     if edit.clone is not None and edit.clone.any():
         rows = torch.arange(len(points)).to(edit.clone.device).repeat_interleave(edit.clone.to(torch.int64))
         copies = {name: value[rows] for name, value in points.params.items()}
@@ -106,11 +131,18 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
         added.append(edit.new.params)
     if edit.drop is not None and edit.drop.any():
         keep = ~edit.drop if keep is None else keep & ~edit.drop
-    if keep is not None:
-        points = points.take(keep)
-    if added:
-        points = points.append({name: torch.cat([rows[name] for rows in added]) for name in points.params})
-    return points if edit.max_opacity is None else _dimmed(primitive, points, edit.max_opacity)
+    new = {name: torch.cat([rows[name] for rows in added]) for name in points.params} if added else None
+    del added
+    if keep is not None or new is not None or order is not None:
+        rows = torch.arange(len(points)) if keep is None else keep.nonzero()[:, 0]
+        rows = rows.to(points.device)
+        means = points.params["means"][rows]
+        if new is not None:
+            means = torch.cat([means, new["means"]])
+            rows = torch.cat([rows, len(points) + torch.arange(len(new["means"]), device=points.device)])
+        points.rearrange(rows if order is None else rows[order(means)], new)
+    if edit.max_opacity is not None:
+        _dim(primitive, points, edit.max_opacity)
 
 
 def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
@@ -165,7 +197,7 @@ def fitted(primitive: Primitive, points: Points) -> Points:
     """The points with the columns that the others determine (`Primitive.dependent`)."""
     with torch.no_grad():
         found = primitive.dependent(points.all_params())
-    return replace(points, params=points.params | found) if found else points
+    return points.with_params(found) if found else points
 
 
 def observe(primitive: Primitive, points: Points, views: Sequence[View], near: float) -> Points:
@@ -174,7 +206,7 @@ def observe(primitive: Primitive, points: Points, views: Sequence[View], near: f
     points = fitted(primitive, points)
     with torch.no_grad():
         found = primitive.observed(points.all_params(), [view.camera for view in views], near)
-    return replace(points, params=points.params | found) if found else points
+    return points.with_params(found) if found else points
 
 
 def merge(edits: Sequence[Edit | None]) -> Edit | None:
@@ -228,26 +260,29 @@ def _lowest(opacities: list[Tensor]) -> Tensor:
     return torch.where(found.isinf(), torch.nan, found)
 
 
-def _adjusted(primitive: Primitive, points: Points, edit: Edit) -> Points:
-    """Points moved, dimmed and scaled, and their moments forgotten, where the edit asks for it."""
-    params = points.params
+def _adjust(primitive: Primitive, points: Points, edit: Edit) -> None:
+    """Move, dim and scale points, and forget their moments, where the edit asks for it."""
     if edit.move is not None:
-        params = primitive.moved(params, edit.move)
+        _put(points, primitive.moved(points.params, edit.move))
     if edit.opacities is not None:
-        params = primitive.with_opacities(params, edit.opacities)
+        _put(points, primitive.with_opacities(points.params, edit.opacities))
     if edit.scale_by is not None:
-        params = primitive.scaled(params, edit.scale_by)
-    points = replace(points, params=params)
+        _put(points, primitive.scaled(points.params, edit.scale_by))
     if edit.values is not None:
-        points = _given(points, edit.values)
+        _give(points, edit.values)
     if edit.forget is None or not edit.forget.any():
-        return points
+        return
     kept = ~edit.forget
-    moments = [
-        {name: value * kept.view(-1, *[1] * (value.dim() - 1)) for name, value in group.items()}
-        for group in (points.exp_avg, points.exp_avg_sq)
-    ]
-    return replace(points, exp_avg=moments[0], exp_avg_sq=moments[1])
+    for group in (points.exp_avg, points.exp_avg_sq):
+        for name, value in group.items():
+            group[name] = points.storage.held(value * kept.view(-1, *[1] * (value.dim() - 1)))
+
+
+def _put(points: Points, params: Columns) -> set[str]:
+    """Let points have other raw parameters where these are others; the names of those."""
+    changed = {name for name, value in params.items() if value is not points.params[name]}
+    points.params.update({name: points.storage.held(params[name]) for name in changed})
+    return changed
 
 
 def _scattered(
@@ -259,28 +294,21 @@ def _scattered(
     return {name: value.index_copy(0, rows, moved[name]) for name, value in params.items()}
 
 
-def _given(points: Points, values: Columns) -> Points:
-    """Points with other raw values of some parameters, of points or shared."""
+def _give(points: Points, values: Columns) -> None:
+    """Let points have other raw values of some parameters, of points or shared."""
     known = points.all_params()
     for name, value in values.items():
         if name not in known or value.shape != known[name].shape:
             shape = tuple(known[name].shape) if name in known else "no such parameter"
             raise BadInput(f"Edit.values: {name!r} has shape {tuple(value.shape)}, and the points have {shape}")
-    params, shared = (
-        {name: values.get(name, old) for name, old in group.items()} for group in (points.params, points.shared)
-    )
-    return replace(points, params=params, shared=shared)
+    points.shared.update({name: value for name, value in values.items() if name in points.shared})
+    _put(points, {name: value for name, value in values.items() if name not in points.shared})
 
 
-def _dimmed(primitive: Primitive, points: Points, most: float) -> Points:
-    """Points with opacities of at most `most`, whose optimiser starts anew for what that has changed."""
+def _dim(primitive: Primitive, points: Points, most: float) -> None:
+    """Let points have opacities of at most `most`; the optimiser starts anew for what that has changed."""
     opacities = primitive.activate(points.params | points.shared, 0).opacities.detach()
     wanted = torch.full_like(opacities, torch.nan, dtype=torch.float64).masked_fill(opacities > most, most)
-    params = primitive.with_opacities(points.params, wanted)
-    anew = {name: torch.zeros_like(value) for name, value in params.items() if value is not points.params[name]}
-    return replace(
-        points,
-        params=params,
-        exp_avg=points.exp_avg | anew,
-        exp_avg_sq=points.exp_avg_sq | {name: value.clone() for name, value in anew.items()},
-    )
+    for name in _put(points, primitive.with_opacities(points.params, wanted)):
+        for group in (points.exp_avg, points.exp_avg_sq):
+            group[name] = points.storage.zeros(len(points), points.params[name])

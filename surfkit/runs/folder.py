@@ -140,6 +140,13 @@ class Run:
             return None
         return replace(self, out=self.out / "partition", recipe=replace(self.recipe, pretrain=stage))
 
+    def optimised_stages(self) -> Iterator[RunStage]:
+        """The stages that are optimised, also that of the model that decides the partition; none for other methods."""
+        if self.recipe.has_stages:
+            yield from self.stages
+            if self.partition is not None:
+                yield replace(self.partition.pretrain, setting="partition_pretrain")
+
     @property
     def merged(self) -> RunStage:
         """The stage of all blocks together, for a recipe with a partition."""

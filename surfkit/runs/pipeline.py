@@ -131,7 +131,7 @@ def run(
         known = len(notes.texts)
         stages.begin()
         warned = notes.texts[known:]  # runs that take the stage repeat what its journal warns of
-        write_run_files(run, backend, prints, notes, scene.frame)
+        write_run_files(run, backend, caches, prints, notes, scene.frame)
         shares.take()
         with record_events(out, warned):
             made = reconstruct(run, given)
@@ -170,9 +170,12 @@ class RecipeStages:
         self.start = self.state = None
         if start is not None:
             discard_results(run, run.pretrain)
-            job = StageJob(run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start)
+            given, points_on = start.given, ctx.caches.points
+            job = StageJob(
+                run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on
+            )
             state = optimise(job, state)
-            del start, job  # to free the memory of the photographs
+            del start, given, job  # to free the memory of the photographs
         elif self.is_shared and run.recipe.partition is None:
             state = load_state(run, run.pretrain, ctx.scene)
         ctx.keep("pretrain")
@@ -189,8 +192,9 @@ class RecipeStages:
         with prefix_notes("partition: "), record_events(run.out):
             state = load_state(run, run.pretrain, ctx.scene, repair=True)
             if (start := initial_points(run, ctx.scene, ctx.caches, state)) is not None:
+                given, points_on = start.given, ctx.caches.points
                 job = StageJob(
-                    run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start
+                    run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on
                 )
                 optimise(job, state)
 
@@ -202,6 +206,7 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     refuse_unused(run.recipe)
     refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
+    caches.points.refuse_unfit((at.setting, at.stage, at.primitive) for at in run.optimised_stages())
     if run.recipe.partition is not None:
         compute.workers.ready()
     for mesher in run.recipe.meshers:

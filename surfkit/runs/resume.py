@@ -27,6 +27,7 @@ from surfkit.runs.folder import Run, read_data, read_record
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.run_notes import RunNotes
 from surfkit.scene.scene import Frame, Scene
+from surfkit.train.data_cache import CacheSettings
 
 PUT_BACK = "put them back"
 SAME_PLACE = 1e-6
@@ -242,7 +243,9 @@ def _moved(run: Run, frame: Frame) -> str | None:
     return f"the reconstruction has other coordinates: the middle of its cameras was {then} and is {here}{grown}"
 
 
-def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: RunNotes, frame: Frame) -> None:
+def write_run_files(
+    run: Run, backend: str, caches: CacheSettings, prints: Fingerprint, notes: RunNotes, frame: Frame
+) -> None:
     """Write run.json, inputs.json and recipe.json; the recipe last, as it makes the folder a run."""
     before = read_record(run.out)
     notes.begin(
@@ -251,6 +254,7 @@ def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: RunNotes
             "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
             "plugins": [str(plugin) for plugin in records() if plugin.distribution],
             "device": backend,
+            "points_on": caches.points.place,
             "threads": torch.get_num_threads(),
             "seed": run.recipe.seed,
             "data": run.data,

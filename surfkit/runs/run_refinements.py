@@ -77,7 +77,8 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
             measure_before(stage, made(), scene)
         shown = _rendered_data(before, given, scene, ctx.rasterizer) if refine.taught else None
         shown = shown or read_ahead(run.data, scene, stage.stage.losses, ctx.caches)
-        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, MemoryMeter.of_stage(), start, given)
+        meter, points_on = MemoryMeter.of_stage(), ctx.caches.points
+        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, meter, start, points_on, given)
         return optimise(job, state)
 
 

@@ -6,7 +6,6 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from surfkit.evaluate.images.measure_images import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Points
+from surfkit.primitives.storage import Storage
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, select
@@ -28,9 +28,10 @@ from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import TrainingData
 from surfkit.train.faults import MAX_RATE_HALVINGS, Diverged, NotFinite, out_of_memory
-from surfkit.train.in_view import with_frozen
+from surfkit.train.in_view import shown_points, why_all, with_frozen
 from surfkit.train.interrupt import graceful
 from surfkit.train.memory_meter import MemoryMeter
+from surfkit.train.points_on import PLACES, PointsOn
 from surfkit.train.progress import TrainingDisplay
 from surfkit.train.retry_on_oom import lowered
 from surfkit.train.state import StageState
@@ -71,6 +72,7 @@ class StageJob:
         meter: Records what the memory is used for.
         start: Gives the initial parameters of the points; if None, they are made from the `cloud`.
         cloud: Gives the initial points; the sparse ones of the scene if None.
+        points_on: Where the points are kept.
         before: The state of the stage before, if its times count too.
         frozen: Gives points that are drawn with the others and never change; None for none.
         owns: As for `Trainer`.
@@ -85,6 +87,7 @@ class StageJob:
     given: TrainingData
     meter: MemoryMeter
     start: Callable[[torch.Generator], InitialModel]
+    points_on: PointsOn
     before: StageState | None = None
     frozen: Callable[[], InitialModel] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
@@ -120,9 +123,13 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
 
     On NaN or Inf it returns to its last checkpoint with half the learning rates, twice at most. When memory runs out,
     it returns to its last checkpoint with a smaller cache, until there is no cache; for the GPU, with no cache there.
+    Then, if the stage allows it, with its points elsewhere (`PointsOn`).
     """
     trainer, along = trainer_of(job), pictures_of(job)
-    fresh = partial(begin, job, trainer)
+
+    def fresh() -> StageState:
+        return begin(job, trainer)
+
     if state is not None:
         say(f"{job.stage.out}: going on after step {state.index} of {job.stage.stage.steps}")
     state = state or fresh()
@@ -134,7 +141,7 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
-            make_room(job, trainer, state, error)
+            trainer = make_room(job, trainer, state, error)
             state = None  # the error and all that it holds go first
         state = state or load_last_state(job.stage, fresh)
 
@@ -153,6 +160,7 @@ def trainer_of(job: StageJob) -> Trainer:
         given.expect,
         job.owns,
         gpu_bytes=given.gpu_bytes() if rasterizer.where().type == "cuda" else 0,
+        home=job.points_on.home(at.folder),
     )
 
 
@@ -168,8 +176,10 @@ def begin(job: StageJob, trainer: Trainer) -> StageState:
     generator = torch.Generator().manual_seed(job.run.recipe.seed)
     began = time.perf_counter(), time.process_time()
     start, primitive = job.start(generator), job.stage.primitive
-    points = replace(Points.fresh(start.params, primitive.shared()), stats=dict(start.stats))
-    state = trainer.begin(points, generator, job.frozen().params if job.frozen else None)
+    points = Points.fresh(start.params, primitive.shared(), trainer.home)
+    points.stats.update({name: points.storage.held(value) for name, value in start.stats.items()})
+    frozen = job.frozen().params if job.frozen else {}
+    state = trainer.begin(points, generator, {name: points.storage.held(value) for name, value in frozen.items()})
     state.sh_degree = min(start.sh_degree, primitive.sh_degree)
     state.seconds, state.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     if job.before is not None:
@@ -180,21 +190,41 @@ def begin(job: StageJob, trainer: Trainer) -> StageState:
     return state
 
 
-def make_room(job: StageJob, trainer: Trainer, state: StageState, error: MemoryError | RuntimeError) -> None:
-    """Keep fewer photographs in the memory that has given out, with a warning.
+def make_room(job: StageJob, trainer: Trainer, state: StageState, error: MemoryError | RuntimeError) -> Trainer:
+    """Keep fewer photographs in the memory that has given out, or else no points, with a warning; what takes the steps
+    from now on.
 
     Raises:
-        OutOfMemory: None are kept in it any more.
+        OutOfMemory: None are kept in it any more, and the points stay.
     """
     at, where = job.stage, f"step {state.index + 1}"
     if is_out_of_gpu_memory(error):
         if state.whole and state.index and at.block is None:  # a block falls back to an earlier, smaller state
             save(at, state, job.meter)
-        if not trainer.uploads.bytes:
-            raise out_of_memory(at.out, ", though photographs are not kept in it", error) from error
-        emit(Warned(lowered(trainer.uploads, f"{where}: the memory of the GPU gave out")))
-    elif not lower_caches(job.given, f"{where}: out of memory"):
-        raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
+        why = f"{where}: the memory of the GPU gave out"
+        if trainer.uploads.bytes:
+            emit(Warned(lowered(trainer.uploads, why)))
+            return trainer
+        kept = out_of_memory(at.out, ", though photographs are not kept in it", error)
+    else:
+        why = f"{where}: out of memory"
+        if lower_caches(job.given, why):
+            return trainer
+        kept = out_of_memory(at.out, ", though photographs are no longer kept in it")
+    home = next_home(job, trainer.home or Storage(trainer.rasterizer.where()), why)
+    if home is None:
+        raise kept from error
+    return replace(trainer, home=home)
+
+
+def next_home(job: StageJob, now: Storage, why: str) -> Storage | None:
+    """Where the points are kept from now on, with a warning, when the memory that they are in has given out; None if
+    they stay there."""
+    place = job.points_on.next_place(now, job.stage.stage, job.stage.primitive)
+    if place is None:
+        return None
+    emit(Warned(f"{why}; points are kept {PLACES[place]} from now on, which is slower (--points-on {place})"))
+    return job.points_on.storage(place, job.stage.folder)
 
 
 def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: ProgressPictures | None) -> StageState:
@@ -212,10 +242,13 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
             display.show(done)
             meter.step(state, job.given, trainer.uploads)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < MIN_FREE_MEMORY_BYTES:
-                lower_caches(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
+                why = f"step {done.index}: only {free >> 20} MiB of memory are free"
+                on_host = state.points.device.type == "cpu"
+                if not lower_caches(job.given, why) and on_host and (home := next_home(job, state.points.storage, why)):
+                    state.move(trainer.rasterizer.where(), home)
             if along is not None and intervals.pictures and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
-                    along.look(done.index, drawing(at, state, trainer.rasterizer))
+                    along.look(done.index, lambda view: drawn_now(trainer, state, view))
             is_over = request.asked or done.index == job.until
             if is_over or done.index % intervals.checkpoint == 0 or done.index == steps:
                 save(at, state, meter)
@@ -294,15 +327,22 @@ def drawing(stage: RunStage, state: StageState, rasterizer: Rasterizer, geometry
 
 def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable[[View, bool], Maps]:
     """A function that renders the points of a stage as they are when it is called, with those that are frozen."""
-    at = job.stage
 
     def draw(view: View, geometry: bool) -> Maps:
         with job.meter.adding("pictures"):
-            degree = state.sh_degree
-            splats = with_frozen(trainer, state, at.primitive.activate(at.stage.finished(state), degree), degree)
-            return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
+            return drawn_now(trainer, state, view, geometry, distortion=False)
 
     return draw
+
+
+def drawn_now(trainer: Trainer, state: StageState, view: View, geometry: bool = True, distortion: bool = True) -> Maps:
+    """Maps of a view with the points of a stage between two steps, and those that are frozen."""
+    stage, primitive, camera, degree = trainer.stage, trainer.primitive, view.camera, state.sh_degree
+    if why_all(stage, primitive) is None:
+        _, splats = shown_points(trainer, state, camera, degree)
+    else:
+        splats = with_frozen(trainer, state, primitive.activate(stage.finished(state), degree), degree)
+    return trainer.draws.render(splats, camera, stage.near, geometry, distortion).maps
 
 
 def select_rasterizer(device: Device) -> tuple[Rasterizer, str]:

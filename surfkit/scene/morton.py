@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+AT_ONCE = 2**18
+"""Positions whose places along the curve are computed together: of all, they would take more memory than the order."""
+
 
 def morton_order(means: np.ndarray, cubes: bool = False) -> np.ndarray:
     """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another.
@@ -15,10 +18,12 @@ def morton_order(means: np.ndarray, cubes: bool = False) -> np.ndarray:
         return np.zeros(0, np.int64)
     low, high = means.min(0), means.max(0)
     extent = np.full(3, (high - low).max(), means.dtype) if cubes else high - low
-    cells = ((means - low) / np.where(extent > 0, extent, 1) * (2**21 - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
-    for axis in range(3):
-        code |= _spread(cells[:, axis]) << np.uint64(axis)
+    for begin in range(0, len(means), AT_ONCE):
+        some = slice(begin, begin + AT_ONCE)
+        cells = ((means[some] - low) / np.where(extent > 0, extent, 1) * (2**21 - 1)).astype(np.uint64)
+        for axis in range(3):
+            code[some] |= _spread(cells[:, axis]) << np.uint64(axis)
     return np.argsort(code, kind="stable")
 
 

@@ -166,7 +166,7 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
             groups[group][name] = value
     appearances, frozen = groups.pop("looks"), groups.pop("frozen")
     columns = {attribute: groups[group] for group, attribute in TENSOR_GROUPS.items()}
-    points = Points(**columns, shared=groups["shared"])
+    points = Points(columns["params"], columns["exp_avg"], columns["exp_avg_sq"], columns["stats"], groups["shared"])
     _check(path, points, tensors["order"], facts)
     _check_frozen(path, points, frozen)
     generator = torch.Generator()

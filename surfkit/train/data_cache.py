@@ -21,6 +21,7 @@ from surfkit.scene.cache import Cache, share
 from surfkit.scene.decoded_photos import DecodedPhotoCache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene
+from surfkit.train.points_on import PointsOn
 
 CACHE_REDUCTION = 4
 """The caches keep this share of what they held when memory ran short, the first time; nothing the second time."""
@@ -31,7 +32,7 @@ GPU_SHARE = 0.25
 
 @dataclass(frozen=True)
 class CacheSettings:
-    """Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
+    """Where photographs, masks and depth priors are kept at hand, and points; the result does not depend on it.
 
     Attributes:
         cache: Memory for them, such as "4GB"; "auto" takes half of what is free.
@@ -40,12 +41,14 @@ class CacheSettings:
             when a stage begins.
         maps: Disk, in the user's cache, for depth maps that runs make whose data sets have none, such as "20GB"; None
             makes none, which does change the result of recipes that want some.
+        points: Where points are kept.
     """
 
     cache: str = "auto"
     copies: bool = False
     maps: str | None = "20GB"
     gpu: str = "auto"
+    points: PointsOn = PointsOn()
 
     def bytes(self) -> int:
         """The memory that may be taken now."""

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.core.registry import name_of
 from surfkit.primitives.base import Primitive
-from surfkit.primitives.points import Columns
+from surfkit.primitives.drawing import draws_itself
+from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.camera import Camera
 from surfkit.train.point_blocks import SORTED_EVERY, PointBlocks, put_in_order
 from surfkit.train.setup import StageSetup
+from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 
 
@@ -76,10 +79,47 @@ def current_blocks(setup: StageSetup, state: StageState) -> PointBlocks:
     It is due every so many steps (and at each edit, `step.densify`), so that a run that goes on has the same order.
     """
     if state.index % SORTED_EVERY == 0:
-        put_in_order(state.points)
+        points, state.blocks = state.points.to_rearrange(), None  # which hold the columns
+        put_in_order(points)
+        state.points = points
+    return blocks_of(setup, state)
+
+
+def blocks_of(setup: StageSetup, state: StageState) -> PointBlocks:
+    """The blocks of the points as they are."""
     if state.blocks is None or not state.blocks.are_of(state.points.params):
         state.blocks = PointBlocks.of(setup.primitive, state.points.params)
     return state.blocks
+
+
+def shown_points(setup: StageSetup, state: StageState, camera: Camera, degree: int) -> tuple[Tensor, Splats]:
+    """(R,) rows of the points that a view may show; and these, where the rasterizer draws, in the colours that they
+    leave the stage with, and then those of the frozen ones. For a stage with steps for the points in view."""
+    blocks = blocks_of(setup, state)
+    in_view = PointsInView.of(setup.primitive, state.points.params, camera, setup.rasterizer, setup.stage.near, blocks)
+    some = Points(on(setup.rasterizer.where(), in_view.of_columns(state.points.params)), {}, {})
+    params = setup.stage.finished(replace(state, points=some))
+    shape = setup.primitive.activate(params, degree)
+    return in_view.rows, with_frozen(setup, state, shape, degree, camera)
+
+
+def on(device: torch.device, columns: Columns) -> Columns:
+    """Columns on a device."""
+    return {name: value.to(device) for name, value in columns.items()}
+
+
+def why_all(stage: Stage, primitive: Primitive) -> str | None:
+    """What lets steps of a stage be for all points, by its name in the stage, and what to do; None where all steps are
+    for the points in view."""
+    if not stage.optimizer.in_view:
+        return f"optimizer:{name_of(stage.optimizer)} is for all points; choose optimizer:adam-in-view"
+    if stage.regularizers:
+        return f"regularizers.{next(iter(stage.regularizers))} looks at all points; drop it"
+    if pairs := [name for name, loss in stage.losses.items() if loss.needs_neighbour]:
+        return f"losses.{pairs[0]} looks at two views; drop it"
+    if primitive.shared() or draws_itself(primitive):
+        return f"primitive {name_of(primitive)} is drawn as a whole; choose another"
+    return None
 
 
 @torch.no_grad()
@@ -94,13 +134,13 @@ def with_frozen(
     setup: StageSetup, state: StageState, shape: Splats, degree: int, camera: Camera | None = None
 ) -> Splats:
     """The splats of a state, detached, and then those that are frozen; of these, with a camera, those in view."""
-    splats, frozen = shape.detached(), state.frozen
+    splats, frozen, where = shape.detached(), state.frozen, shape.means.device
     if not frozen:
         return splats
     if camera is not None:
         frozen = PointsInView.of(setup.primitive, frozen, camera, setup.rasterizer, setup.stage.near).of_columns(frozen)
     shared = {name: value.detach() for name, value in state.points.shared.items()}
-    return splats.and_then(setup.primitive.activate(frozen | shared, degree))
+    return splats.and_then(setup.primitive.activate(on(where, frozen | shared), degree))
 
 
 def true_rows(mask: Tensor) -> Tensor:

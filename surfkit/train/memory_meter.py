@@ -6,7 +6,14 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from surfkit.core.events import MemoryTaken, emit
-from surfkit.core.memory import highest_memory_bytes, peak_memory_bytes, reset_peak_memory, resident_bytes
+from surfkit.core.memory import (
+    highest_memory_bytes,
+    mapped_bytes,
+    peak_memory_bytes,
+    reset_peak_memory,
+    resident_bytes,
+)
+from surfkit.primitives.storage import DiskStorage
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes, reset_peak_gpu
 from surfkit.train.data_cache import TrainingData
 from surfkit.train.state import StageState
@@ -22,12 +29,14 @@ class MemoryMeter:
     The program and the scene are what the process held before and more of it after reading the data. Points with their
     moments, and what the caches keep, are counted: the most of each. Writing checkpoints and drawing pictures or
     measuring count by what they add to the most that was held until then. All else is taken by the steps: the
-    rasterizer, gradients, losses, and photographs while they are decoded. The memory of a GPU is split likewise.
+    rasterizer, gradients, losses, and photographs while they are decoded. The memory of a GPU is split likewise. Of
+    points on the disk, what is in memory counts, though the system takes that back where it needs it.
     """
 
     def __init__(self) -> None:
         reset_peak_memory()
         reset_peak_gpu()
+        self.mapped = mapped_bytes()
         self.gpu = {"points": 0, "photographs": 0}
         self.parts = {"program": resident_bytes(), "scene": 0, "points": 0}
         self.caches: dict[str, int] = {}
@@ -48,9 +57,11 @@ class MemoryMeter:
 
     def step(self, state: StageState, data: TrainingData, uploads: Uploads) -> None:
         """See what is held after a step."""
-        groups = (*vars(state.points).values(), state.frozen, state.appearances)
-        points = sum(value.nbytes for group in groups for value in group.values())
-        where = self.gpu if state.points.params["means"].is_cuda else self.parts
+        beside = sum(value.nbytes for group in (state.frozen, state.appearances) for value in group.values())
+        points = state.points.nbytes + beside
+        where = self.gpu if state.points.device.type == "cuda" else self.parts
+        if isinstance(state.points.storage, DiskStorage):  # in memory is what was looked at
+            points = min(points, max(0, mapped_bytes() - self.mapped))
         where["points"] = max(where["points"], points)
         self.gpu["photographs"] = max(self.gpu["photographs"], uploads.bytes)
         for name, count in data.bytes().items():

@@ -82,15 +82,13 @@ def _members(groups: Tensor, size: int, count: int) -> Tensor:
     return members[members < count]
 
 
+def spatial_order(means: Tensor) -> Tensor:
+    """(N,) int64 indices that put (N, 3) positions along a Z-order curve: what one view shows then lies together in
+    memory, and in blocks."""
+    return torch.from_numpy(morton_order(means.detach().cpu().numpy(), cubes=True)).to(means.device)
+
+
 @torch.no_grad()
 def put_in_order(points: Points) -> None:
-    """Put points along a Z-order curve, in place: what one view shows then lies together in memory, and in blocks.
-
-    One column after the other is copied, so that no more than one stands twice.
-    """
-    means = points.params["means"].detach()
-    order = torch.from_numpy(morton_order(means.cpu().numpy(), cubes=True)).to(means.device)
-    for group in (points.params, points.exp_avg, points.exp_avg_sq, points.stats):
-        for name in group:
-            if name not in points.shared:
-                group[name] = group[name][order]
+    """Put points in spatial order, in place."""
+    points.rearrange(spatial_order(points.params["means"]))

@@ -12,7 +12,8 @@ from surfkit.densify.base import Policy, Step, ViewStatistics
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
-from surfkit.train.in_view import with_frozen
+from surfkit.scene.camera import Camera
+from surfkit.train.in_view import shown_points
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
 from surfkit.train.step_result import StepResult
@@ -22,25 +23,28 @@ from surfkit.train.view_order import ViewContributions
 def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     """What the policies are told about a step, and nothing about frozen points."""
     stage, index, gradients, in_view = setup.stage, state.index + 1, result.gradients, result.in_view
-    camera, points = result.target.view.camera, len(state.points)
+    camera, points, home = result.target.view.camera, len(state.points), state.points.device
     combined = stage.signal.combine(
         gradients.signal if gradients.chosen is None else gradients.chosen, gradients.signal
     )
-    signed_norm = lengths(gradients.signal)
+    signed_norm = lengths(gradients.signal).to(home)
     shown = ViewStatistics(
         rows=None if in_view is None else in_view.rows,
-        seen=result.seen,
-        grad_norm=signed_norm if combined is gradients.signal else lengths(combined),
-        radii=result.radii,
+        seen=result.seen.to(home),
+        grad_norm=signed_norm if combined is gradients.signal else lengths(combined).to(home),
+        radii=result.radii.to(home),
         signed_norm=signed_norm,
     )
 
     @cache
     def drawn() -> Splats:
-        return result.splats if in_view is None else with_frozen(setup, state, all_splats(setup, state), 0)
+        return result.splats if in_view is None else all_splats(setup, state)
 
     def of_all(name: str) -> Callable[[], Tensor]:
         return lambda: getattr(shown, name) if in_view is None else in_view.among_all(getattr(shown, name))
+
+    def of_view(camera: Camera) -> tuple[Tensor, Splats]:
+        return shown_points(setup, state, camera, 0)
 
     return Step(
         index=index,
@@ -50,7 +54,9 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
         grad_norm=of_all("grad_norm"),
         radii=of_all("radii"),
         image_px=max(camera.width, camera.height),
-        views=ViewContributions(setup.views, setup.draws, drawn, stage.near, points),
+        views=ViewContributions(
+            setup.views, setup.draws, drawn, stage.near, points, of_view=None if in_view is None else of_view
+        ),
         since_reset=index - state.reset_at,
         rates=rates_at(setup, state),
         seed=state.seed,

@@ -12,6 +12,7 @@ from surfkit.core.schedule import LearningRate
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.storage import Storage
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import View
 from surfkit.train.neighbour_selector import NeighbourSelector
@@ -36,6 +37,8 @@ class StageSetup:
         beside: Gives the positions of the views that may be second ones, best first, from the position of a view and
             the depth that is rendered there; None finds them by the cameras (`NeighbourSelector.neighbours`).
         gpu_bytes: Photographs, masks and priors that may be kept on a GPU.
+        home: Where the points are kept; None where the rasterizer draws. Elsewhere, steps must be for the points in
+            view alone (`in_view.why_all`).
     """
 
     stage: Stage
@@ -49,6 +52,7 @@ class StageSetup:
     owns: Callable[[Tensor], Tensor] | None = None
     beside: Callable[[int, Tensor], list[int]] | None = None
     gpu_bytes: int = 0
+    home: Storage | None = None
 
     @cached_property
     def draws(self) -> Rasterizer:
@@ -57,7 +61,7 @@ class StageSetup:
 
     @cached_property
     def uploads(self) -> Uploads:
-        """The photographs, masks and priors, where the points are."""
+        """The photographs, masks and priors, where the rasterizer draws."""
         return Uploads(self.rasterizer.where(), self.photos, self.masks, self.priors, self.gpu_bytes)
 
     @cached_property

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 
 from surfkit.primitives.points import Columns, Points
+from surfkit.primitives.storage import Storage
 from surfkit.train.point_blocks import PointBlocks
 from surfkit.train.view_order import ViewOrder
 
@@ -45,10 +46,13 @@ class StageState:
     frozen: Columns = field(default_factory=dict)
     """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
 
-    def move(self, device: torch.device) -> None:
-        """Put what is optimised, and what is drawn with it, on a device; counts stay where the host reads them."""
-        self.points = self.points.to(device)
-        self.frozen = {name: value.to(device) for name, value in self.frozen.items()}
+    def move(self, device: torch.device, home: Storage | None = None) -> None:
+        """Put what is optimised, and what is drawn with it, on a device; counts stay where the host reads them. `home`:
+        where the points are kept, if not there."""
+        home = home or Storage(device)
+        if self.points.storage != home:
+            self.points, self.blocks = self.points.to(home), None  # which hold the columns
+            self.frozen = {name: home.held(value) for name, value in self.frozen.items()}
         self.appearances = {n: v.to(device) if v.is_floating_point() else v for n, v in self.appearances.items()}
 
     @property

@@ -12,14 +12,14 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import PointsEdited, emit
 from surfkit.losses.base import RegularizerInput
 from surfkit.primitives.drawing import refuse_wrong_maps
-from surfkit.primitives.edit import Edit, apply, fitted, observe
+from surfkit.primitives.edit import Edit, apply_in_place, fitted, observe
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
 from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
 from surfkit.train.next_view import neighbour, next_target
 from surfkit.train.optimizer import OptimizerInput
-from surfkit.train.point_blocks import put_in_order
+from surfkit.train.point_blocks import spatial_order
 from surfkit.train.policies import rates_at, told, wanted
 from surfkit.train.required_maps import GEOMETRY_MAPS, maps_of_step
 from surfkit.train.setup import StageSetup
@@ -36,7 +36,8 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     # Render: raw parameters become splats, and these the maps that the terms of this step read.
     in_view = PointsInView.of_step(setup, state, camera)
     params = state.points.all_params() if in_view is None else in_view.of_columns(state.points.params)
-    leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
+    where = setup.rasterizer.where()
+    leaves = {name: value.detach().to(where).requires_grad_() for name, value in params.items()}
     shape = setup.primitive.activate(leaves, state.sh_degree)
     splats = with_frozen(setup, state, shape, state.sh_degree, None if in_view is None else camera)
     render = setup.draws.render(splats, camera, stage.near, bool(reads.keys() & GEOMETRY_MAPS), "distortion" in reads)
@@ -75,7 +76,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     if result.appearance is not None:
         result.appearance.learn()
     about = OptimizerInput(index, rates_at(setup, state), result.rows, state.seed, result.pull)
-    stage.optimizer.step(state.points, grads, about)
+    stage.optimizer.step(state.points, {name: grad.to(state.points.device) for name, grad in grads.items()}, about)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
     else:
@@ -86,14 +87,13 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
 
 def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
     """Drop, clone and split points, together with their moments and statistics."""
-    index = state.index + 1
+    index, order = state.index + 1, spatial_order if setup.stage.optimizer.in_view else None
 
     # Densify: all that the policies ask for is done at once.
-    points = apply(setup.primitive, state.points, edit, state.generator)
+    points, state.blocks = state.points.to_rearrange(), None  # which hold the columns
+    apply_in_place(setup.primitive, points, edit, state.generator, order)
     if len(points) == 0:
         raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
-    if setup.stage.optimizer.in_view:
-        put_in_order(points)
     state.points = observe(setup.primitive, points, setup.views, setup.stage.near)
     if edit.max_opacity is not None:
         state.reset_at = index

@@ -53,16 +53,16 @@ class Trainer(StageSetup):
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
-        state.move(self.rasterizer.where())
+        state.move(self.rasterizer.where(), self.home)
         return state
 
     def run(self, state: StageState, clock: Stopwatch | None = None) -> Iterator[CompletedStep]:
         """Take the steps that are left; after each one, `state` can be saved, and the caller may stop.
 
-        The points of `state` are moved to where the rasterizer draws. The caller may stop the `clock` of the state.
+        The points of `state` are moved to where they are kept (`home`). The caller may stop the `clock` of the state.
         """
         clock = clock or Stopwatch(state)
-        state.move(self.rasterizer.where())
+        state.move(self.rasterizer.where(), self.home)
         foretell(self, state.order)
         while state.index < self.stage.steps:
             done = self.step(state)
@@ -79,7 +79,9 @@ class Trainer(StageSetup):
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // self.stage.sh_every))
         result = retry_on_oom(state, self.uploads, lambda: view_gradients(self, state))
         edit = update(self, state, result)
+        losses, maps, target = result.losses, result.maps, result.target
+        del result  # what else it holds is of no use in an edit, which takes memory of its own
         if edit is not None:
             retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
         state.index, state.whole = index, True
-        return CompletedStep(index, result.losses, len(state.points), result.maps, result.target)
+        return CompletedStep(index, losses, len(state.points), maps, target)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from surfkit.core.lazy import Lazy
 from surfkit.densify.base import Contribution
 from surfkit.raster.api import Rasterizer, Splats
+from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
 
@@ -50,6 +51,9 @@ class ViewContributions:
     near: float  # type: ignore[misc]  # the splats must be given, which mypy does not see
     rows: int | None = None
     """Of how many of the splats, the first ones, it tells; None for all."""
+    of_view: Callable[[Camera], tuple[Tensor, Splats]] | None = None
+    """Gives (R,) the rows that a view may show, and these splats, with others behind them; None draws all. With it,
+    `rows` is known."""
     tallies: dict[tuple[float, float], Contribution] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -57,22 +61,45 @@ class ViewContributions:
 
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
         """See `Views.each`."""
+        for shown, amount, count in self.shown(alpha_power, transmittance_power):
+            if not isinstance(shown, slice):
+                amount, count = (v.new_zeros(self._told(v)).index_copy_(0, shown, v) for v in (amount, count))
+            yield amount, count
+
+    def shown(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor | slice, Tensor, Tensor]]:
+        """For each view, which splats it may show, (R,) indices or a slice, and the two of `each` of these."""
+        powers = alpha_power, transmittance_power
         for view in self.views:
-            found = self.rasterizer.contribution(self.shape, view.camera, self.near, alpha_power, transmittance_power)
-            yield found[0][: self.rows], found[1][: self.rows]
+            if self.of_view is None:
+                amount, count = self.rasterizer.contribution(self.shape, view.camera, self.near, *powers)
+                yield slice(None), amount[: self.rows], count[: self.rows]
+            else:
+                rows, splats = self.of_view(view.camera)
+                amount, count = self.rasterizer.contribution(splats, view.camera, self.near, *powers)
+                yield rows, amount[: len(rows)].to(rows.device), count[: len(rows)].to(rows.device)
 
     def contributions(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Contribution:
         """See `Views.contributions`."""
         powers = (alpha_power, transmittance_power)
         if powers not in self.tallies:
-            mean = torch.zeros_like(self.shape.opacities[: self.rows])
-            peak = torch.zeros_like(mean)
-            hits, views = (torch.zeros_like(mean, dtype=torch.int64) for _ in range(2))
-            for amount, count in self.each(*powers):
+            found: Contribution | None = None
+            for shown, amount, count in self.shown(*powers):
+                found = found or self._nothing(amount)
                 here = amount / count.clamp_min(1)
-                mean += here
-                torch.maximum(peak, here, out=peak)
-                hits += count
-                views += count > 0
-            self.tallies[powers] = Contribution(mean / len(self.views), peak, hits, views)
+                found.mean[shown] += here
+                found.peak[shown] = torch.maximum(found.peak[shown], here)
+                found.hits[shown] += count
+                found.views[shown] += count > 0
+            assert found is not None, "there are views"
+            self.tallies[powers] = replace(found, mean=found.mean / len(self.views))
         return self.tallies[powers]
+
+    def _nothing(self, amount: Tensor) -> Contribution:
+        """What no view tells, where the amounts of one lie."""
+        told = self._told(amount)
+        zeros = (amount.new_zeros(told, dtype=kind) for kind in (amount.dtype, amount.dtype, torch.int64, torch.int64))
+        return Contribution(*zeros)
+
+    def _told(self, amount: Tensor) -> int:
+        """Of how many it tells, given the amounts of a view."""
+        return len(amount) if self.rows is None else self.rows

@@ -79,7 +79,7 @@ def test_a_statistic_begins_at_zero_and_is_kept():
 
 def test_to_moves_every_group():
     moved = points().to("meta")
-    assert all(v.device.type == "meta" for group in vars(moved).values() for v in group.values())
+    assert all(v.device.type == "meta" for group in moved.groups for v in group.values())
 
 
 def test_merge_lets_drop_win_over_split_and_split_over_clone():

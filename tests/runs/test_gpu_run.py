@@ -17,13 +17,14 @@ from surfkit.evaluate.images.measure_images import evaluate_views
 from surfkit.io.datasets.data import Data
 from surfkit.raster.select import select
 from surfkit.runs import measure_run as measure
-from surfkit.runs import pipeline
+from surfkit.runs import pipeline, run_stage
 from surfkit.runs.pipeline import Intervals, run
 from surfkit.runs.recipe import with_steps
 from surfkit.runs.run_status import status
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train import trainer
+from surfkit.train import checkpoint, trainer
+from surfkit.train.adam import AdamInView
 from surfkit.train.data_cache import CacheSettings
 
 STEPS = 20
@@ -144,6 +145,33 @@ def test_a_budget_of_the_gpu(gpu, data, recipe, tmp_path):
     view = 3 * 48 * 36
     assert [each["photographs"] for each in (whole, none, two)] == [10 * view, 0, 2 * view]
     assert cloud(tmp_path / "a") == cloud(tmp_path / "b") == cloud(tmp_path / "c")
+
+
+def test_where_it_gives_out_for_good_points_are_kept_on_the_host_if_steps_need_those_in_view_alone(
+    gpu, data, recipe, tmp_path, monkeypatch
+):
+    """The state after the last step is kept, and the run goes on from there."""
+    out, next_home, save, places = tmp_path / "run", run_stage.next_home, checkpoint.save, {}
+
+    def full():
+        if not notes(out):
+            gpu.limit = gpu.held + 20_000
+
+    def more_room(*given):
+        gpu.limit = None
+        return next_home(*given)
+
+    def saved(path, state):
+        places[state.index] = state.points.device.type
+        save(path, state)
+
+    during(monkeypatch, "view_gradients", 14, full)
+    monkeypatch.setattr(run_stage, "next_home", more_room)
+    monkeypatch.setattr(checkpoint, "save", saved)
+    run(evolve(recipe, "pretrain.optimizer", AdamInView()), data, out, intervals=EVERY, caches=CacheSettings(gpu="0"))
+    assert places == {8: "cuda", 13: "cuda", 16: "cpu", 20: "cpu"}
+    told = "step 14: the memory of the GPU gave out; points are kept in the memory of the CPU"
+    assert any(told in text for text in notes(out))
 
 
 def notes(out):

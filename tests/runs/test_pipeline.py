@@ -84,7 +84,7 @@ def test_memory_is_told_by_part(finished):
     assert peak <= metrics["peak_memory_bytes"] and sum(parts.values()) == peak and min(parts.values()) >= 0
     assert parts["photographs"] == 10 * 64 * 48 * 3
     state = load_run(out)[1]
-    end = sum(value.nbytes for group in vars(state.points).values() for value in group.values())
+    end = state.points.nbytes
     assert end / 2 <= parts["points"] <= 2 * end and parts["program"] > 50e6
 
 

@@ -18,7 +18,7 @@ STAGE = Stage(steps=24, sh_every=6, densify=ADC(start=4, until=20, every=5, thre
 
 
 def same(a, b) -> bool:
-    groups = zip(vars(a.points).values(), vars(b.points).values(), strict=True)
+    groups = zip(a.points.groups, b.points.groups, strict=True)
     return all(x.keys() == y.keys() and all(torch.equal(x[k], y[k]) for k in x) for x, y in groups)
 
 

@@ -44,6 +44,7 @@ class FixedCosts:
         read_peak_bytes: Most memory held while it was read.
         checkpoint_every: Steps between checkpoints.
         threads: That read photographs.
+        movable: Whether points can be kept elsewhere than where they are drawn (`--points-on`).
     """
 
     steps: int
@@ -58,6 +59,7 @@ class FixedCosts:
     read_peak_bytes: int
     checkpoint_every: int
     threads: int
+    movable: bool = False
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class ResourceEstimate:
         data_bytes: Undistorted photographs, beside the data set or in the user's cache.
         room: What the machine has.
         probe_seconds: That the probe took.
+        movable_bytes: Points with their moments and statistics that can be kept elsewhere than where they are drawn.
     """
 
     points: int
@@ -124,6 +127,7 @@ class ResourceEstimate:
     room: MachineLimits
     probe_seconds: float = 0.0
     gpu: GpuEstimate | None = None
+    movable_bytes: int = 0
 
 
 def estimate(
@@ -170,6 +174,7 @@ def estimate(
         data_bytes=int(load.undistort * load.undistort_bytes),
         room=room,
         gpu=_on_gpu(load, rising, probed, free) if (free := probed.started.gpu_free_bytes) else None,
+        movable_bytes=int(rising.last * probed.written.checkpoint_bytes) if load.movable else 0,
     )
 
 
@@ -214,7 +219,19 @@ def _gpu_memory(found: ResourceEstimate) -> list[Finding]:
     fewer = found.points - (rest - free) / max(gpu.point_bytes, 1)
     if fewer > 0.1 * found.points:
         text += f", and so do fewer points: {COUNT_CAP} {one_digit(fewer)}"
+    moved = found.movable_bytes
+    if moved and rest - moved <= free:
+        left = f"leaves at most {size(max(0, rest - moved))} there"
+        if found.memory_bytes - found.cache_bytes + moved <= USABLE_SHARE * found.room.memory_bytes:
+            text += f"; --points-on host {left}, and takes {size(moved)} of the memory of the CPU"
+        elif _fits_disk(found):
+            text += f"; --points-on disk {left}, and takes {size(moved)} of the disk"
     return [Finding("warning", "gpu-memory", text)]
+
+
+def _fits_disk(found: ResourceEstimate) -> bool:
+    """Whether there are points that can be kept in files, and the disk of the run folder has room for them."""
+    return 0 < found.movable_bytes <= USABLE_SHARE * found.room.run_bytes - found.run_bytes
 
 
 def _memory(found: ResourceEstimate) -> list[Finding]:
@@ -231,7 +248,14 @@ def _memory(found: ResourceEstimate) -> list[Finding]:
         text += "smaller photographs (--scale 2) need less"
         if fewer > 0.1 * found.points:
             text += f", and so do fewer points: {COUNT_CAP} {one_digit(fewer)}"
-        text += f" with --cache {size(MIN_CACHE_BYTES, 0).replace(' ', '')}"
+        least = f" with --cache {size(MIN_CACHE_BYTES, 0).replace(' ', '')}"
+        text += least
+        left = rest - found.movable_bytes + MIN_CACHE_BYTES
+        if found.gpu is None and left <= free and _fits_disk(found):
+            text += (
+                f"; --points-on disk{least} takes at most {size(left)} of memory and {size(found.movable_bytes)} of "
+                "the disk, with the same result"
+            )
     return [Finding("warning", "memory", text)]
 
 

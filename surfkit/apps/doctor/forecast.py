@@ -30,6 +30,7 @@ from surfkit.scene.available_memory import cache_bytes, free_bytes
 from surfkit.scene.decoded_photos import place
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import needs_normals, needs_priors
+from surfkit.train.in_view import why_all
 
 PROBE_VIEWS = 10
 """Photographs that the probe trains on, evenly chosen; each part of it sees all of them."""
@@ -174,6 +175,7 @@ def _load(data: Data, recipe: Recipe, examined: ExaminedData, plan: ProbePlan) -
         read_peak_bytes=examined.read_peak_bytes,
         checkpoint_every=CHECKPOINT_EVERY,
         threads=min(4, os.cpu_count() or 1),
+        movable=why_all(recipe.pretrain, recipe.primitive) is None,
     )
 
 

@@ -23,6 +23,8 @@ DENSIFIED_GROWTH = 3.0
 TRAINED_POINT_BYTES, FROZEN_POINT_BYTES = 3_000, 1_500
 """Memory of a point: with parameters, moments, gradients and buffers of the rasterizer; and of a frozen one, without
 moments and gradients. Measured at 1,640 and 770 for each additional point; about as much again is for tiles."""
+FILED_POINT_BYTES = 300
+"""Memory of a point that is kept in a file: what an edit takes, measured at 140, and as much for what views show."""
 FROZEN_TIME_SHARE = 0.75
 """Time of a frozen point in a step, as a share of that of another (measured: 0.78 ms to 1.03 ms for 1,000 points)."""
 
@@ -86,10 +88,11 @@ def initial_points(block: BlockRun) -> BlockPoints:
     return BlockPoints(planned.points, max(0, both - planned.points), False)
 
 
-def point_memory(block: BlockRun) -> int:
-    """Bytes of memory that the points of a block may need."""
+def point_memory(block: BlockRun, filed: bool = False) -> int:
+    """Bytes of memory that the points of a block may need; `filed`: as they are kept in files."""
     grown = DENSIFIED_GROWTH if block.run.recipe.tune.densify is not None else 1.0
-    return initial_points(block).bytes(TRAINED_POINT_BYTES, FROZEN_POINT_BYTES, grown)
+    each = (FILED_POINT_BYTES, FILED_POINT_BYTES) if filed else (TRAINED_POINT_BYTES, FROZEN_POINT_BYTES)
+    return initial_points(block).bytes(*each, grown)
 
 
 def forecast(blocks: Sequence[BlockRun], coarse: StoredState, memory: Sequence[int]) -> Forecast:

@@ -362,7 +362,9 @@ def job_of(ctx: RunContext, block: BlockRun, compute: Compute) -> Job:
         compute.device,
     ]
     command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
-    command += ["--gpu-cache", ctx.caches.gpu]
+    command += ["--gpu-cache", ctx.caches.gpu, "--points-on", ctx.caches.points.place]
+    if ctx.caches.points.scratch is not None:
+        command += ["--scratch", str(ctx.caches.points.scratch.resolve())]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
     command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
     command += ["--patience", f"{WORKER_PATIENCE_S}"] * elsewhere
@@ -371,12 +373,13 @@ def job_of(ctx: RunContext, block: BlockRun, compute: Compute) -> Job:
     views = [view for view in ctx.scene.train if view.name in names]
     photos = 3 * sum(view.camera.width * view.camera.height for view in views)
     cached = photos if elsewhere and ctx.caches.cache == "auto" else min(share, photos)
+    points = point_memory(block, filed=ctx.caches.points.place == "disk")
     return Job(
         index=block.index,
         folder=block.folder,
         call=lambda: train_block(ctx, block),
         command=tuple(command),
         cost=block.planned.work,
-        memory_bytes=PROGRAM_BYTES + point_memory(block) + TRAINING_PIXEL_BYTES * pixels + cached,
+        memory_bytes=PROGRAM_BYTES + points + TRAINING_PIXEL_BYTES * pixels + cached,
         needs=(ctx.run.data.path, views[0].path),
     )

@@ -123,8 +123,9 @@ def take_steps(ctx: RunContext, block: BlockRun) -> None:
         if context == "frozen":
             start, frozen = replace(start, part="own"), replace(start, part="around")
         owns = None if context == "densified" else start.owns
-        intervals, meter = replace(ctx.intervals, pictures=0), MemoryMeter.of_stage()
-        job = StageJob(ctx.run, stage, scene, ctx.rasterizer, intervals, given, meter, start, frozen=frozen, owns=owns)
+        intervals, meter, points_on = replace(ctx.intervals, pictures=0), MemoryMeter.of_stage(), caches.points
+        what = ctx.run, stage, scene, ctx.rasterizer, intervals, given, meter, start, points_on
+        job = StageJob(*what, frozen=frozen, owns=owns)
         for until in stops(block, done):
             state = optimise(replace(job, until=until), take_in(block, state))
     else:

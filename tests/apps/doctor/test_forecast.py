@@ -342,6 +342,50 @@ def test_what_to_lower_where_a_gpu_is_small(free, words):
     assert estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), probed(), ROOM).gpu is None
 
 
+@pytest.mark.parametrize(
+    "memory, disk, words",
+    [
+        (
+            5 * 10**9,
+            10**12,
+            "; --points-on disk with --cache 200MB takes at most 3.8 GB of memory and 1.4 GB of",
+        ),
+        (5 * 10**9, 4 * 10**9, None),  # the run folder takes 3.3 GB of it
+        (4 * 10**9, 10**12, None),
+        (9_500_000_000, 10**12, None),  # a smaller cache will do
+    ],
+)
+def test_points_in_files_where_memory_is_short(memory, disk, words):
+    room = replace(ROOM, memory_bytes=memory, run_bytes=disk)
+    given = parts(1_000_000, 2_000_000), rising(2_000_000), probed(), room
+    text = advice(estimate(replace(LOAD, movable=True), *given))[0].text
+    assert words in text if words else "--points-on" not in text
+    assert "--points-on" not in advice(estimate(LOAD, *given))[0].text, "steps that look at all points need all of them"
+
+
+@pytest.mark.parametrize(
+    "free, memory, disk, words",
+    [
+        (
+            8 * 10**9,
+            10**12,
+            10**12,
+            "; --points-on host leaves at most 6.6 GB there, and takes 1.4 GB of the memory",
+        ),
+        (8 * 10**9, 25 * 10**8, 10**12, "; --points-on disk leaves at most 6.6 GB there, and takes 1.4 GB of the disk"),
+        (8 * 10**9, 25 * 10**8, 4 * 10**9, None),
+        (5 * 10**9, 10**12, 10**12, None),
+    ],
+)
+def test_points_elsewhere_where_a_gpu_is_small(free, memory, disk, words):
+    taken = (SegmentCosts(1_000_000, 0.5, 10**9, 4 * 10**9), SegmentCosts(2_000_000, 0.5, 10**9, 8 * 10**9))
+    started, load = replace(STARTED, gpu_free_bytes=free), replace(LOAD, movable=True, budget_bytes=0)
+    result = ProbeResult(started, taken, replace(WRITTEN, peak_bytes=10**9))
+    found = estimate(load, parts(10**6, 2 * 10**6), rising(2_000_000), result, MachineLimits(memory, disk, 10**12))
+    texts = {finding.what: finding.text for finding in advice(found)}
+    assert words in texts["gpu-memory"] if words else "--points-on" not in texts["gpu-memory"]
+
+
 def test_points_that_begin_dense_multiply_less():
     """By runs of recipe:surface: steps, points at the beginning and at the end."""
     measured = [
