@@ -72,8 +72,9 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
         result.appearance.learn()
-    about = OptimizerInput(index, rates_at(setup, state), result.rows, state.seed, result.pull)
-    stage.optimizer.step(state.points, grads, about)
+    about = index, stage.steps, rates_at(setup, state), result.rows, state.seed, result.pull
+    drawn = result.target, result.render.maps, result.shape.detached()
+    stage.optimizer.step(state.points, grads, OptimizerInput(*about, *drawn))
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
     else:
