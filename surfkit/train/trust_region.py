@@ -52,7 +52,7 @@ class TrustRegion(Optimizer):
     in_view: ClassVar[bool] = True
     pulls: ClassVar[bool] = True
 
-    radius: float = 3e-4
+    radius: float = 1e-4
     """Squared Hellinger distance by which a parameter may change a splat in the first step."""
 
     last_radius: float = 1e-5
