@@ -2,9 +2,9 @@
 
 For each optimizer a run of `recipe:2dgs` with losses of colours, begun at the sparse points of a data set and shortened
 to some hundred steps: with these points alone or, with `--densify`, with those that the recipe adds and drops. Learning
-rates but those of positions are multiplied by what stands behind an optimizer, as in `adam*8`. CPU time is that of all
-threads within the steps; without OMP_WAIT_POLICY, threads that wait for others on a busy machine count as work. PSNR is
-the mean of the held-out photographs, every eighth.
+rates but those of positions are multiplied by what stands behind an optimizer, as in `adam*8`; with `adam*8-1` the
+factor falls from 8 to 1. CPU time is that of all threads within the steps; without OMP_WAIT_POLICY, threads that wait
+for others on a busy machine count as work. PSNR is the mean of the held-out photographs, every eighth.
 """
 
 from __future__ import annotations
@@ -33,17 +33,19 @@ from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer
 
 
-def times(rate: LearningRate, factor: float) -> LearningRate:
-    """A learning rate that is `factor` times as high."""
-    return LearningRate(rate.start * factor, None if rate.end is None else rate.end * factor)
+def times(rate: LearningRate, first: float, last: float) -> LearningRate:
+    """A learning rate that is `first` times as high at the begin, and `last` times at the end."""
+    return LearningRate(rate.start * first, (rate.start if rate.end is None else rate.end) * last)
 
 
 def begun(scene: Scene, steps: int, densify: bool, name: str) -> tuple[Trainer, StageState]:
-    """Before the first step; `name` as in `adam*8`."""
-    optimizer, _, factor = name.partition("*")
+    """Before the first step; `name` as in `adam*8-1`."""
+    optimizer, _, factors = name.partition("*")
+    first, _, last = factors.partition("-")
+    factor = float(first or 1), float(last or first or 1)
     recipe = rescale(SURFELS, steps / SURFELS.pretrain.steps)
     primitive, stage = recipe.primitive, recipe.pretrain
-    rates = {n: times(r, 1 if n == "means" else float(factor or 1)) for n, r in rates_of(stage, primitive).items()}
+    rates = {n: r if n == "means" else times(r, *factor) for n, r in rates_of(stage, primitive).items()}
     losses = {key: stage.losses[key] for key in ("l1", "ssim")}
     stage = replace(stage, rates=rates, losses=losses, optimizer=find(Optimizer, optimizer)())
     if not densify:
