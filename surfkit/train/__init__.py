@@ -7,7 +7,6 @@ import surfkit
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.train.adam import Adam, AdamInView
-from surfkit.train.trust_region import TrustRegion
 
 sys.modules[__name__].__class__ = surfkit.TrainFolder
 
@@ -15,4 +14,4 @@ sys.modules[__name__].__class__ = surfkit.TrainFolder
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Optimizers, by name."""
-    return {"adam": Adam, "adam-in-view": AdamInView, "trust-region": TrustRegion}
+    return {"adam": Adam, "adam-in-view": AdamInView}

@@ -55,7 +55,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
-    """Move the points, and tell which ones the policies would have more or fewer of."""
+    """Move the points, and tell which ones the policies, which see them as drawn, would have more or fewer of."""
     stage, index, view, in_view = setup.stage, state.index + 1, result.target.view.name, result.in_view
     state.whole = False  # until the step is done
 
@@ -65,7 +65,6 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
-    # Policies look at the points as they were drawn.
     edit = wanted(stage.policies, state.points, told(setup, state, result)) if stage.policies else None
     grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()), stage.optimizer.pulls)
     if in_view is not None:
