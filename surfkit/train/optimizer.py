@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns, Points
-from surfkit.raster.api import Maps
+from surfkit.raster.api import Maps, Splats
 
 
 @dataclass(frozen=True)
@@ -21,19 +22,27 @@ class OptimizerInput:
 
     Attributes:
         index: The step, from 1.
+        steps: Of the whole stage.
         rates: Learning rate of each parameter; of positions, local units.
         rows: (R,) int64, the points that the step is for, different ones; None where it is for all N.
         seed: Differs from step to step and from run to run; for optimizers that draw.
         pull: From cotangents of the maps that the step has drawn to gradients by the raw parameters, shapes as those of
             the losses: the product with the transposed Jacobian, at the price of a backward pass. Only for an optimizer
             with `pulls`, and before it changes anything.
+        target: The photograph of the step.
+        maps: What was drawn.
+        splats: The points that the step is for, as they were drawn.
     """
 
     index: int
+    steps: int
     rates: Mapping[str, float]
     rows: Tensor | None
     seed: int
     pull: Callable[[Maps], Columns]
+    target: Target
+    maps: Maps
+    splats: Splats
 
 
 class Optimizer(Component):

@@ -59,7 +59,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
-    """Move the points, and tell which ones the policies would have more or fewer of."""
+    """Move the points, and tell which ones the policies, which see them as drawn, would have more or fewer of."""
     stage, index, view, in_view = setup.stage, state.index + 1, result.target.view.name, result.in_view
     state.whole = False  # until the step is done
 
@@ -68,15 +68,16 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
-    # Policies look at the points as they were drawn.
     edit = wanted(stage.policies, state.points, told(setup, state, result)) if stage.policies else None
     grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()), stage.optimizer.pulls)
     if in_view is not None:
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
         result.appearance.learn()
-    about = OptimizerInput(index, rates_at(setup, state), result.rows, state.seed, result.pull)
-    stage.optimizer.step(state.points, {name: grad.to(state.points.device) for name, grad in grads.items()}, about)
+    about = index, stage.steps, rates_at(setup, state), result.rows, state.seed, result.pull
+    drawn = result.target, result.maps, result.shape.detached()
+    grads = {name: grad.to(state.points.device) for name, grad in grads.items()}
+    stage.optimizer.step(state.points, grads, OptimizerInput(*about, *drawn))
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())
     else:
