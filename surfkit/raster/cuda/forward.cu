@@ -16,6 +16,7 @@ forward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entrie
         Buffer<float> distortion, Buffer<float> open, Buffer<int> last, Buffer<int> middle, Buffer<float> shift,
         Buffer<float> m1, Buffer<float> m2, Buffer<unsigned> blended) {
     SHARED(Staged, staged, kBatch);
+    SHARED(Reach, reaches, kBatch);
     const Pixel pixel(view);
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
     const long long begin = offsets[pixel.tile], end = offsets[pixel.tile + 1];
@@ -27,14 +28,16 @@ forward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entrie
         const int count = (int)min((long long)kBatch, end - at);
         if (threadIdx.x < count) {
             const Entry entry = entries[at + threadIdx.x];
-            staged[threadIdx.x] = stage(view, pixel.tile, records[entry.record]);
+            const SplatRecord r = records[entry.record];
+            staged[threadIdx.x] = stage(view, pixel.tile, r);
+            reaches[threadIdx.x] = reach(view, pixel.tile, r);
         }
         __syncthreads();
         for (int group = 0; group < count; group += 32) {
             const int mine = group + lane;
             bool is_near = false;
             if (mine < count) {
-                const Staged s = staged[mine];
+                const Reach s = reaches[mine];
                 is_near = touches(s, pixel);
             }
             unsigned hits = 0;

@@ -13,7 +13,7 @@ gather(Buffer<const float> means, Buffer<const float> quats, Buffer<const float>
     const long long r = blockIdx.x * 128LL + threadIdx.x;
     if (r >= index.size || index[r] >= rows) return;
     constexpr int color_at = Splat::sums - 4, chosen_at = Splat::sums;
-    double s[WIDTH] = {};
+    Pair s[WIDTH] = {};
     bool is_hit = false;
     for (long long slot = first[r]; slot < first[r + 1]; slot++) {
         if (!touched[slot]) continue;
@@ -23,12 +23,14 @@ gather(Buffer<const float> means, Buffer<const float> quats, Buffer<const float>
     if (!is_hit) return;
     const Arrays splats = {means, quats, scales, opacities, sh};
     const long long i = index[r];
-    const SplatIn<double> in = read_splat(splats, i, kColumns);
-    SplatGrad<double> g = splat_backward(kKind, in, view.camera, view.form, s);
-    shade_backward(splats, i, shade(splats, i, in, view.camera), s + color_at, g, d_sh);
-    d_means[3 * i] = (float)g.mean.x;
-    d_means[3 * i + 1] = (float)g.mean.y;
-    d_means[3 * i + 2] = (float)g.mean.z;
+    const SplatIn<Pair> in = read_splat(splats, i, kColumns);
+    const SplatGrad<Pair> g = splat_backward(kKind, in, view.camera, view.form, s);
+    const float color[3] = {(float)s[color_at], (float)s[color_at + 1], (float)s[color_at + 2]};
+    const Shade<float> look = shade(splats, i, rounded(in.mean - view.camera.centre));
+    const Vec<float> mean = rounded(g.mean) + shade_backward(splats, i, look, color, d_sh);
+    d_means[3 * i] = mean.x;
+    d_means[3 * i + 1] = mean.y;
+    d_means[3 * i + 2] = mean.z;
     for (int k = 0; k < 4; k++) d_quats[4 * i + k] = (float)g.quat[k];
     for (int k = 0; k < kColumns; k++) d_scales[kColumns * i + k] = (float)g.scale[k];
     d_opacities[i] = (float)g.opacity;

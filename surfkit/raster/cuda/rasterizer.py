@@ -40,18 +40,24 @@ NEVER = torch.iinfo(torch.int64).max
 
 
 class RasterView(ctypes.Structure):
-    """`RasterView` of view.h."""
+    """`View` of view.h, where a `Pair` is two floats."""
 
     _fields_ = (
-        ("pose", ctypes.c_double * 15),  # rotation by columns, translation, and the camera's position
-        ("lens", ctypes.c_double * 5),  # fx, fy, cx, cy, near
+        ("pose", ctypes.c_float * 30),  # rotation by columns, translation, and the camera's position
+        ("lens", ctypes.c_float * 10),  # fx, fy, cx, cy, near
         ("size", ctypes.c_int * 2),
-        ("dilation", ctypes.c_double),
+        ("dilation", ctypes.c_float * 2),
         ("is_compensated", ctypes.c_bool),
         ("geometry", ctypes.c_int),
-        ("rim", ctypes.c_double),
+        ("rim", ctypes.c_float),
         ("tiles", ctypes.c_int * 2),
     )
+
+
+def _pairs(*numbers: float) -> list[float]:
+    """Each as the sum of two floats, one after the other."""
+    highs = [ctypes.c_float(number).value for number in numbers]
+    return [part for number, high in zip(numbers, highs, strict=True) for part in (high, number - high)]
 
 
 def _view(splats: Splats, camera: Camera, near: float, rim: float) -> RasterView:
@@ -60,10 +66,10 @@ def _view(splats: Splats, camera: Camera, near: float, rim: float) -> RasterView
     numbers = [*turn.T.flatten().tolist(), *shift.tolist(), *(-turn.T @ shift).tolist()]
     width, height = camera.width, camera.height
     return RasterView(
-        (ctypes.c_double * 15)(*numbers),
-        (ctypes.c_double * 5)(camera.fx, camera.fy, camera.cx, camera.cy, near),
+        (ctypes.c_float * 30)(*_pairs(*numbers)),
+        (ctypes.c_float * 10)(*_pairs(camera.fx, camera.fy, camera.cx, camera.cy, near)),
         (ctypes.c_int * 2)(width, height),
-        splats.dilation,
+        (ctypes.c_float * 2)(*_pairs(splats.dilation)),
         splats.antialias,
         GEOMETRIES.index(splats.geometry),
         rim,
@@ -282,15 +288,18 @@ class TileRasterizer(Rasterizer):
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = self._pass(_grey(splats), camera, near, rim=0.0)
-        at = camera.project(points.to(drawn.device)).contiguous()
+        at = camera.project(points.to(drawn.device))
         x, y, z = at.unbind(1)
         inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         order = inside.nonzero()[:, 0]
-        tile = (y[order].long() // TILE_SIDE_PX) * drawn.view.tiles[0] + x[order].long() // TILE_SIDE_PX
-        order = order[tile.argsort(stable=True)]  # threads of a warp read the same list
+        column, row = (each.int() // TILE_SIDE_PX for each in (x, y))
+        tile = row * drawn.view.tiles[0] + column
+        order = order[tile[order].argsort(stable=True)]  # threads of a warp read the same list
+        middles = (torch.stack([column, row], 1) + 0.5) * TILE_SIDE_PX
+        local = torch.cat([at[:, :2] - middles, at[:, 2:]], 1).float()
         opacity = drawn.arrays[0].new_full((len(points),), torch.nan)
         program = drawn.program("contribution", LEVEL=LEVEL_GEOMETRY, CHOSEN=CHOSEN_NOTHING)
-        program.launch("probe", blocks(len(order)), 128, *drawn.lists, at, order, opacity)
+        program.launch("probe", blocks(len(order)), 128, *drawn.lists, local, tile, order, opacity)
         return opacity.to(points.device)
 
     def _pass(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> RasterPass:
@@ -320,6 +329,5 @@ def source(name: str, **defines: int) -> CudaSource:
         "SplatRecord", (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * RECORD_BYTES[defines["KIND"]]),)}
     )
     entry = type("Entry", (ctypes.Structure,), {"_fields_": (("record", ctypes.c_int), ("slot", ctypes.c_int))})
-    return CudaSource(
-        KERNEL_FOLDER / f"{name}.cu", defines, {"SplatRecord": record, "Entry": entry, "View": RasterView}
-    )
+    structures = {"SplatRecord": record, "Entry": entry, "View": RasterView}
+    return CudaSource(KERNEL_FOLDER / f"{name}.cu", defines, structures, is_exact=name in ("project", "gather"))

@@ -26,11 +26,25 @@ constexpr int kWarps = kThreads / 32;
 constexpr int kStrip = 8, kRows = 4;  // pixels of a warp
 
 struct View {
-    CameraModel<double> camera;
-    splat::GaussianForm form;
-    double rim;
+    CameraModel<Pair> camera;
+    GaussianForm form;
+    float rim;
     int tiles_x, tiles_y;
 };
+
+inline Vec<float> rounded(Vec<Pair> v) { return {(float)v.x, (float)v.y, (float)v.z}; }
+inline CameraModel<float> rounded(const CameraModel<Pair>& c) {
+    return {{rounded(c.turn.c0), rounded(c.turn.c1), rounded(c.turn.c2)},
+            rounded(c.shift),
+            rounded(c.centre),
+            (float)c.fx,
+            (float)c.fy,
+            (float)c.cx,
+            (float)c.cy,
+            (float)c.near,
+            c.width,
+            c.height};
+}
 
 #ifdef COEFFICIENTS
 // Activated values of splats, as in raster/api.py.
@@ -79,8 +93,11 @@ struct Staged {
     float normal[3];
 #endif
     float color[3];
+};
+// Where it may be drawn, in shared memory too.
+struct Reach {
     Bound<float> bound;  // about the tile's centre
-    splat::Outline<float> outline;
+    Outline<float> outline;
 };
 
 // The tile's centre, less the splat's anchor.
@@ -105,14 +122,22 @@ inline Staged stage(const View& view, int tile, const SplatRecord& r) {
         o.normal[c] = r.normal[c];
 #endif
     }
-    const float hyy = 1 / r.flat, hxy = r.tilt * hyy;
-    o.bound = {r.mx - sx, r.my - sy, r.wide + r.tilt * hxy, hxy, hyy, r.disc_x - sx, r.disc_y - sy, r.disc_r2};
-    o.outline = splat::outline(o.bound);
     return o;
 }
 
+// (sx, sy): what it is to be about, less the splat's anchor. Not by `outline`: of a long and thin ellipse it would lose
+// the width, which the record has.
+inline Reach reach(const SplatRecord& r, float sx, float sy) {
+    const float hyy = 1 / r.flat, hxy = r.tilt * hyy, hxx = r.wide + r.tilt * hxy, hx = square_root(hxx);
+    return {{r.mx - sx, r.my - sy, hxx, hxy, hyy, r.disc_x - sx, r.disc_y - sy, r.disc_r2},
+            {hx, square_root(hyy), r.tilt, r.wide, hxy / hx}};
+}
+inline Reach reach(const View& view, int tile, const SplatRecord& r) {
+    return reach(r, from_anchor_x(view, tile, r), from_anchor_y(view, tile, r));
+}
+
 // Whether a splat may touch one of the warp's pixels.
-inline bool touches(const Staged& s, const Pixel& p) {
+inline bool touches(const Reach& s, const Pixel& p) {
     float low, high;
     const float slack = 2e-3f;  // the bound is in float here
     return splat::bound_span(s.bound, s.outline, p.top - slack, p.top + kRows - 1 + slack, low, high) &&
