@@ -144,10 +144,8 @@ def expected(case: Case, gpu: Gpu) -> dict[str, float | int | str]:
 
 PIECE, TILES = (64, 64), 7500
 """Pixels that are emulated, and tiles of 16 x 16 of 1600 x 1200."""
-SORTED = 4 * 2 * (4 + 8) + 4
-"""Bytes of main memory to sort a key of 32 bits with a place of 64: a count, four passes that read and write both."""
-LISTED = 60
-"""Bytes of main memory to bring what was sorted in order."""
+LISTED = 73
+"""Bytes of main memory to list a splat that is seen by its depth."""
 SLOW = {"div": 10, "rcp": 6, "sqrt": 10}
 """Multiply-adds that one of these takes."""
 
@@ -215,6 +213,11 @@ def instructions(ptx: str, kind: str) -> int:
     return sum(SLOW.get(name, 1) for name in found)
 
 
+def sorted_bytes(key: int) -> int:
+    """Of main memory, to sort a key of so many bytes with a place of 8: a count, and a pass for each that moves both."""
+    return key + key * 2 * (key + 8)
+
+
 def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
     """The launches of a step on a piece of a view of so many surfels, and how many points and pairs it has."""
     share = PIECE[0] * PIECE[1] / 256 / TILES
@@ -259,9 +262,9 @@ def rasterizer(count: int, gpu: Gpu) -> dict[str, object]:
         }
         limits[name] = max(parts, key=parts.__getitem__)
         times[name] = 1e3 * parts[limits[name]]
-    times["sort"] = 1e3 * (SORTED + LISTED) * (facts["pairs"] + facts["seen"]) / gpu.memory
-    limits["sort"] = "main memory"
-    forward = sum(times[name] for name in ("measure", "sort", "record", "forward"))
+    sorts = facts["pairs"] * sorted_bytes(2) + facts["seen"] * (LISTED + sorted_bytes(4))
+    times["sort"], limits["sort"] = 1e3 * sorts / gpu.memory, "main memory"
+    forward = sum(times[name] for name in ("measure", "record", "sort", "list", "forward"))
     return {
         "seen": round(facts["seen"]),
         "pairs": round(facts["pairs"]),

@@ -48,33 +48,33 @@ SPLAT_FN bool valid(const SplatIn<Real>& s, int columns) {
     return none == 0 && positive;
 }
 
-// Colour of a splat at d from the camera, and what its gradient needs.
+// Colour of a splat, below 0 too.
+template <class Arrays, class R>
+SPLAT_FN void shade(const Arrays& s, long long i, const splat::Sight<R>& sight, R rgb[3]) {
+    for (int c = 0; c < 3; c++) rgb[c] = R(0.5);
+    const long long row = 3LL * s.coefficients * i;
+    for (int k = 0; k < s.coefficients; k++)
+        for (int c = 0; c < 3; c++) rgb[c] += sight.basis[k] * s.sh[row + 3 * k + c];
+}
+
+// How a colour follows its splat: whether each channel is above 0, and if so its gradient by the mean.
 template <class R>
-struct Shade {
-    splat::Sight<R> sight;
-    R rgb[3];
+struct Tint {
+    Vec<R> by_mean[3];
+    bool is_lit[3];
 };
 template <class Arrays, class R>
-SPLAT_FN Shade<R> shade(const Arrays& s, long long i, Vec<R> d) {
-    Shade<R> o{splat::sight(d, s.coefficients), {R(0.5), R(0.5), R(0.5)}};
+SPLAT_FN Tint<R> tint(const Arrays& s, long long i, const splat::Sight<R>& sight, const R rgb[3]) {
+    Tint<R> o{};
     const long long row = 3LL * s.coefficients * i;
-    for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) o.rgb[c] += o.sight.basis[k] * s.sh[row + 3 * k + c];
+    for (int c = 0; c < 3; c++) {
+        o.is_lit[c] = rgb[c] > 0;
+        if (!o.is_lit[c] || s.coefficients == 1 || !(sight.length > 0)) continue;
+        R by_basis[16];
+        for (int k = 0; k < s.coefficients; k++) by_basis[k] = s.sh[row + 3 * k + c];
+        o.by_mean[c] = splat::sight_backward(sight, s.coefficients, by_basis);
+    }
     return o;
-}
-// dL/d(mean) by the direction. `out_sh` has the layout of s.sh.
-template <class Arrays, class R, class Out>
-SPLAT_FN Vec<R> shade_backward(const Arrays& s, long long i, const Shade<R>& o, const R rgb[3], const Out& out_sh) {
-    R g[3], weight[16] = {};
-    for (int c = 0; c < 3; c++) g[c] = o.rgb[c] > 0 ? rgb[c] : R(0);
-    const long long row = 3LL * s.coefficients * i;
-    for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) {
-            out_sh[row + 3 * k + c] = (float)(g[c] * o.sight.basis[k]);
-            weight[k] += g[c] * s.sh[row + 3 * k + c];
-        }
-    if (s.coefficients == 1 || !(o.sight.length > 0)) return {0, 0, 0};
-    return splat::sight_backward(o.sight, s.coefficients, weight);
 }
 
 // A little larger than exact, so that the float32 row test never loses a pixel.

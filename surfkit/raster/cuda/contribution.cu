@@ -83,13 +83,13 @@ contribution(View view, Buffer<const SplatRecord> records, Buffer<const Entry> e
 
 // Sums and numbers of each splat of `index`, over the slots from first[r] on.
 KERNEL(128)
-total(Buffer<const long long> index, Buffer<const long long> first, Buffer<const float> sums, Buffer<const int> counts,
+total(Buffer<const long long> index, Buffer<const int> first, Buffer<const float> sums, Buffer<const int> counts,
       Buffer<float> total_sum, Buffer<long long> total_count) {
     const long long r = blockIdx.x * 128LL + threadIdx.x;
     if (r >= index.size) return;
     Pair sum = 0;
     long long count = 0;
-    for (long long slot = first[r]; slot < first[r + 1]; slot++) {
+    for (int slot = first[r]; slot < first[r + 1]; slot++) {
         sum += sums[slot];
         count += counts[slot];
     }

@@ -8,6 +8,12 @@ using namespace surfkit;
 
 namespace {
 
+#if TILE_BYTES == 2
+typedef short TileNumber;
+#else
+typedef int TileNumber;
+#endif
+
 // Projects a splat, and calls f(tile) for the tiles that it may touch; false if it is not drawn. `bound` is the exact
 // one.
 template <class F>
@@ -55,8 +61,8 @@ measure(Buffer<const float> means, Buffer<const float> quats, Buffer<const float
 // on.
 KERNEL(128)
 record(Buffer<const float> means, Buffer<const float> quats, Buffer<const float> scales, Buffer<const float> opacities,
-       Buffer<const float> sh, View view, Buffer<const long long> index, Buffer<const long long> first,
-       Buffer<SplatRecord> records, Buffer<int> tile_of, Buffer<int> record_of) {
+       Buffer<const float> sh, View view, Buffer<const long long> index, Buffer<const int> first,
+       Buffer<SplatRecord> records, Buffer<SplatTint> tints, Buffer<TileNumber> tile_of, Buffer<int> record_of) {
     const long long r = blockIdx.x * 128LL + threadIdx.x;
     if (r >= index.size) return;
     const Arrays splats = {means, quats, scales, opacities, sh};
@@ -64,14 +70,25 @@ record(Buffer<const float> means, Buffer<const float> quats, Buffer<const float>
     const SplatIn<Pair> in = read_splat(splats, i, kColumns);
     SplatRecord o;
     Bound<Pair> bound;
-    long long slot = first[r];
+    int slot = first[r];
     tiles_of(view, in, o, bound, [&](int tile) {
-        tile_of[slot] = tile;
+        tile_of[slot] = (TileNumber)tile;
         record_of[slot] = (int)r;
         slot++;
     });
-    const Shade<float> look = shade(splats, i, rounded(in.mean - view.camera.centre));
+    const Sight seen = sight(view, in);
+    float rgb[3];
+    shade(splats, i, seen, rgb);
     // NaN stays, so that the picture shows it: to ask for it here would wait for the device.
-    for (int c = 0; c < 3; c++) o.color[c] = look.rgb[c] < 0 ? 0.0f : look.rgb[c];
+    for (int c = 0; c < 3; c++) o.color[c] = rgb[c] < 0 ? 0.0f : rgb[c];
     records[r] = o;
+    if (kKeepsTints) tints[r] = tint(splats, i, seen, rgb);
+}
+
+// The list of all tiles, in the order of their sorted slots.
+KERNEL(128) list(Buffer<const long long> slots, Buffer<const int> record_of, Buffer<Entry> entries) {
+    const long long k = blockIdx.x * 128LL + threadIdx.x;
+    if (k >= slots.size) return;
+    const int slot = (int)slots[k];
+    entries[k] = {record_of[slot], slot};
 }

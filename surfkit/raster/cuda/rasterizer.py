@@ -30,6 +30,7 @@ KERNEL_FOLDER = Path(__file__).parent
 TILE_SIDE_PX, WARPS_PER_TILE = 16, 8
 SURFEL, GAUSSIAN, RAY = 0, 1, 2
 RECORD_BYTES = {SURFEL: 192, GAUSSIAN: 128, RAY: 192}
+TINT_BYTES, ENTRY_BYTES = 40, 8
 SUMS = {SURFEL: 20, GAUSSIAN: 16, RAY: 24}
 """Sums over the pixels that each splat gets on the way back; with chosen losses 4 more, of which 2 are used."""
 LEVEL_COLOR, LEVEL_GEOMETRY, LEVEL_DISTORTION = 0, 1, 2
@@ -89,7 +90,7 @@ class RasterPass:
         arrays: The five tensors of the splats.
         seen, radii: As in `Render`.
         index: (M,) int64, the splat of each record: those seen, by depth.
-        first: (M + 1,) int64, the first slot of each record; a slot is a pair of a splat and a tile.
+        first: (M + 1,) int32, the first slot of each record; a slot is a pair of a splat and a tile.
         entries: (slots, 2) int32, record and slot, by tile and depth; those of tile t are offsets[t] to offsets[t + 1].
     """
 
@@ -109,7 +110,9 @@ class RasterPass:
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
         self.coefficients = self.arrays[4].shape[1]
         self.tiles = self.view.tiles[0] * self.view.tiles[1]
-        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, COEFFICIENTS=self.coefficients)
+        self.tile_bytes = 2 if self.tiles < 2**15 else 4  # a sort takes a pass for each
+        defines = {"COEFFICIENTS": self.coefficients, "TILE_BYTES": self.tile_bytes}
+        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, **defines)
         touched, depth, slots = self._measure(project, splats)
         self._order(touched, depth)
         self._record(project, slots)
@@ -140,19 +143,24 @@ class RasterPass:
         """Give the splats that are seen a record each, by depth, and a slot for each tile; sets `index` and `first`."""
         index = self.seen.nonzero()[:, 0]
         self.index = index[depth[index].argsort(stable=True)]
-        self.first = torch.zeros(len(index) + 1, dtype=torch.int64, device=self.device)
-        torch.cumsum(touched[self.index], 0, out=self.first[1:])
+        self.first = torch.zeros(len(index) + 1, dtype=torch.int32, device=self.device)
+        torch.cumsum(touched[self.index], 0, dtype=torch.int32, out=self.first[1:])
 
     def _record(self, project: Kernels, slots: int) -> None:
-        """Write the records, and list them by tile; sets `records`, `entries` and `offsets`."""
+        """Write the records, and list them by tile; sets `records`, `tints`, `entries` and `offsets`."""
         shape, count = self.arrays[0].new_empty(0), len(self.index)
         self.records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
-        tile_of, record_of = shape.new_empty(2, slots, dtype=torch.int32).unbind()
+        number = torch.int16 if self.tile_bytes == 2 else torch.int32
+        tile_of, record_of = shape.new_empty(slots, dtype=number), shape.new_empty(slots, dtype=torch.int32)
+        keeps_tints = self.coefficients > 4  # `kKeepsTints` of view.h
+        self.tints = shape.new_empty(count * TINT_BYTES * keeps_tints, dtype=torch.uint8)
         given = *self.arrays, self.view, self.index, self.first
-        project.launch("record", blocks(count), 128, *given, self.records, tile_of, record_of)
+        project.launch("record", blocks(count), 128, *given, self.records, self.tints, tile_of, record_of)
         tile_of, slot = tile_of.sort(stable=True)
-        self.entries = torch.stack([record_of[slot], slot.int()], 1)
-        self.offsets = torch.searchsorted(tile_of, torch.arange(self.tiles + 1, device=self.device, dtype=torch.int32))
+        self.entries = shape.new_empty(slots, 2, dtype=torch.int32)
+        project.launch("list", blocks(slots), 128, slot, record_of, self.entries)
+        tiles = torch.arange(self.tiles + 1, device=self.device, dtype=tile_of.dtype)
+        self.offsets = torch.searchsorted(tile_of, tiles)
 
     @property
     def lists(self) -> tuple[object, ...]:
@@ -220,7 +228,8 @@ class CudaRender(Render):
         part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
         program = {"CHOSEN": int(chosen is not None), "WIDTH": width, "COEFFICIENTS": drawn.coefficients}
         gather = drawn.program("gather", LEVEL=LEVEL_COLOR, **program)
-        given = *arrays, drawn.view, drawn.index, drawn.first, sums, touched, rows
+        harmonics = arrays[4][:0] if len(drawn.tints) else arrays[4]
+        given = *arrays[:4], harmonics, drawn.view, drawn.tints, drawn.index, drawn.first, sums, touched, rows
         gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
         home = drawn.home
         standard: dict[str, Any] = {name: grad.to(home) for name, grad in zip(STANDARD, grads, strict=True)}
@@ -323,11 +332,14 @@ def _grey(splats: Splats) -> Splats:
     return replace(splats, sh=splats.sh.new_zeros(len(splats), 1, 3))
 
 
+def _raw(name: str, size: int) -> type[ctypes.Structure]:
+    """A structure of which only the size is known."""
+    return type(name, (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * size),)})
+
+
 def source(name: str, **defines: int) -> CudaSource:
     """The source of NAME.cu for one kind of splats."""
-    record = type(
-        "SplatRecord", (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * RECORD_BYTES[defines["KIND"]]),)}
-    )
-    entry = type("Entry", (ctypes.Structure,), {"_fields_": (("record", ctypes.c_int), ("slot", ctypes.c_int))})
-    structures = {"SplatRecord": record, "Entry": entry, "View": RasterView}
+    sizes = {"SplatRecord": RECORD_BYTES[defines["KIND"]], "SplatTint": TINT_BYTES, "Entry": ENTRY_BYTES}
+    sizes["TileNumber"] = defines.get("TILE_BYTES", 4)
+    structures = {"View": RasterView, **{name: _raw(name, size) for name, size in sizes.items()}}
     return CudaSource(KERNEL_FOLDER / f"{name}.cu", defines, structures, is_exact=name in ("project", "gather"))

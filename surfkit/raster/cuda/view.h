@@ -52,6 +52,13 @@ struct Arrays {
     Buffer<const float> means, quats, scales, opacities, sh;
     static constexpr int coefficients = COEFFICIENTS;
 };
+typedef splat::Sight<float> Sight;
+inline Sight sight(const View& view, const SplatIn<Pair>& in) {
+    return splat::sight(rounded(in.mean - view.camera.centre), COEFFICIENTS);
+}
+typedef Tint<float> SplatTint;
+// `record` keeps the tints for the way back where they are less to read than the harmonics.
+constexpr bool kKeepsTints = COEFFICIENTS > 4;
 #endif
 
 // A splat of a tile's list: which record draws it, and which row of sums its gradient goes to.
