@@ -206,15 +206,13 @@ def blending(ptx: str) -> str:
 
 
 def instructions(ptx: str, kind: str) -> int:
-    """Arithmetic of a type in PTX, that which takes longer as often as it does. Signs go with the operands of others."""
-    found = re.findall(
-        rf"^\s+(add|sub|mul|fma|mad|min|max|div|rcp|sqrt|ex2|lg2|setp|selp)\S*\.{kind}\s", ptx, re.M
-    )
+    """Arithmetic of a type in PTX, that which takes longer as often as it does; signs come with operands."""
+    found = re.findall(rf"^\s+(add|sub|mul|fma|mad|min|max|div|rcp|sqrt|ex2|lg2|setp|selp)\S*\.{kind}\s", ptx, re.M)
     return sum(SLOW.get(name, 1) for name in found)
 
 
 def sorted_bytes(key: int) -> int:
-    """Of main memory, to sort a key of so many bytes with a place of 8: a count, and a pass for each that moves both."""
+    """Of main memory, to sort a key of so many bytes with a place of 8: a count, a pass for each that moves both."""
     return key + key * 2 * (key + 8)
 
 

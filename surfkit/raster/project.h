@@ -143,8 +143,9 @@ SPLAT_FN bool project_one(const SplatIn<Real>& in, const CameraModel<Real>& cam,
 // What both records of gaussians have.
 template <class Record>
 SPLAT_FN void fill_footprint(Record& r, const Gaussian<Real>& g) {
-    const Real limit = 1 << 22, ax = round_down(clamped(g.x, -limit, limit)) + Real(0.5),
-               ay = round_down(clamped(g.y, -limit, limit)) + Real(0.5);
+    const auto limit = rough(Real(1 << 22)), near_x = rough(g.x), near_y = rough(g.y);
+    const Real ax = round_down(clamped(near_x, -limit, limit)) + Real(0.5),
+               ay = round_down(clamped(near_y, -limit, limit)) + Real(0.5);
     r.x = (float)(g.x - ax);
     r.y = (float)(g.y - ay);
     r.l00 = (float)g.l00;
@@ -199,9 +200,10 @@ SPLAT_FN R largest_scale(const SplatIn<R>& s) {
 template <class R>
 struct Outlook {
     static constexpr float kMargin = 3;  // pixels; the low-pass filter of a surfel reaches 2.36
-    const CameraModel<R> cam;
+    CameraModel<R> cam;
     Vec<R> side[4];  // unit normals of the planes through the camera and the sides of the image, pointing away
 
+    Outlook() = default;
     explicit Outlook(const CameraModel<R>& camera) : cam(camera) {
         const R margin = kMargin, none = 0, left = -margin - cam.cx, right = cam.width + margin - cam.cx,
                 top = -margin - cam.cy, bottom = cam.height + margin - cam.cy;

@@ -233,6 +233,12 @@ struct Bound {
     R dx, dy, r2;
 };
 
+// The squared distance in sigmas at which an opacity falls to kAlphaMin, and a little more.
+template <class R>
+SPLAT_FN auto cutoff(R opacity) {
+    return 2 * natural_log(rough(opacity / R(kAlphaMin))) * rough(R(1.00001)) + rough(R(1e-5));
+}
+
 // Camera-frame quantities that the forward and the backward of both kinds share.
 template <class R>
 struct Posed {
@@ -314,8 +320,8 @@ SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     Contour<R> edge;
     const auto in_front = (p.c.z > cam.near) & (s.opacity > R(kAlphaMin)) & contour(o.h, R(kCutoffSquared), edge) &
                           contour(o.h, R(9), o.low);
-    const R k2 = smallest(2 * natural_log(s.opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5), R(kCutoffSquared));
-    const auto bounded = contour(o.h, k2, edge);
+    const auto k2 = smallest(cutoff(s.opacity), rough(R(kCutoffSquared)));
+    const auto bounded = contour(o.h, R(k2), edge);
     o.bound = {edge.x,
                edge.y,
                edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
@@ -324,9 +330,9 @@ SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
                o.low.x,
                o.low.y,
                k2 / 2};
-    const R limit = R(1 << 22);
-    o.ax = round_down(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
-    o.ay = round_down(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
+    const auto limit = rough(R(1 << 22)), near_x = rough(o.low.x), near_y = rough(o.low.y);
+    o.ax = round_down(smallest(largest(near_x, -limit), limit)) + R(0.5);
+    o.ay = round_down(smallest(largest(near_y, -limit), limit)) + R(0.5);
     const Vec<R> u = o.h.u - o.ax * o.h.w, v = o.h.v - o.ay * o.h.w;
     const Vec<R> a = cross(v, o.h.w), b = cross(o.h.w, u), c = cross(u, v);
     auto size = rough(R(0));
@@ -566,7 +572,7 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     o.l00 = square_root(yy / det);
     o.l01 = -xy / det / o.l00;
     o.l11 = 1 / square_root(yy);
-    const R k2 = 2 * natural_log(opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5);
+    const R k2 = cutoff(opacity);
     o.bound = {o.x, o.y, k2 * xx, k2 * xy, k2 * yy, o.x, o.y, R(-1)};
     // Depth of the largest density along the ray, to first order about the centre (RaDe-GS).
     R q = 0;

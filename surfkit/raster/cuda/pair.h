@@ -65,5 +65,3 @@ inline Pair round_down(Pair x) {
     const float whole = floorf(x.high);
     return whole == x.high ? normalized(whole, floorf(x.low)) : Pair(whole);
 }
-// To float: it only says how far a splat reaches, with slack.
-inline Pair natural_log(Pair x) { return logf((float)x); }

@@ -44,8 +44,7 @@ measure(Buffer<const float> means, Buffer<const float> quats, Buffer<const float
         const Vec<Pair> centre = splat::mul(view.camera.turn, in.mean) + view.camera.shift;
         SplatRecord record;
         Bound<Pair> bound;
-        const Outlook<float> outlook(rounded(view.camera));
-        if (!outlook.misses(kKind, (float)largest_scale(in), rounded(centre)) &&
+        if (!view.outlook.misses(kKind, (float)largest_scale(in), rounded(centre)) &&
             tiles_of(view, in, record, bound, [&](int) { count++; })) {
             z = (float)centre.z;
             if (count)

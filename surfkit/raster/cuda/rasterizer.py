@@ -20,7 +20,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
-from surfkit.raster.culling import boxes_may_touch, may_touch
+from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
 from surfkit.raster.validate import validate
@@ -47,6 +47,9 @@ class RasterView(ctypes.Structure):
         ("pose", ctypes.c_float * 30),  # rotation by columns, translation, and the camera's position
         ("lens", ctypes.c_float * 10),  # fx, fy, cx, cy, near
         ("size", ctypes.c_int * 2),
+        ("rounded_camera", ctypes.c_float * 20),  # pose and lens again
+        ("rounded_size", ctypes.c_int * 2),
+        ("sides", ctypes.c_float * 12),
         ("dilation", ctypes.c_float * 2),
         ("is_compensated", ctypes.c_bool),
         ("geometry", ctypes.c_int),
@@ -65,11 +68,14 @@ def _view(splats: Splats, camera: Camera, near: float, rim: float) -> RasterView
     pose = camera.world_to_camera.double().cpu()
     turn, shift = pose[:3, :3], pose[:3, 3]
     numbers = [*turn.T.flatten().tolist(), *shift.tolist(), *(-turn.T @ shift).tolist()]
-    width, height = camera.width, camera.height
+    lens, width, height = (camera.fx, camera.fy, camera.cx, camera.cy, near), camera.width, camera.height
     return RasterView(
         (ctypes.c_float * 30)(*_pairs(*numbers)),
-        (ctypes.c_float * 10)(*_pairs(camera.fx, camera.fy, camera.cx, camera.cy, near)),
+        (ctypes.c_float * 10)(*_pairs(*lens)),
         (ctypes.c_int * 2)(width, height),
+        (ctypes.c_float * 20)(*numbers, *lens),
+        (ctypes.c_int * 2)(width, height),
+        (ctypes.c_float * 12)(*(number for side in image_sides(camera) for number in side)),
         (ctypes.c_float * 2)(*_pairs(splats.dilation)),
         splats.antialias,
         GEOMETRIES.index(splats.geometry),

@@ -27,24 +27,13 @@ constexpr int kStrip = 8, kRows = 4;  // pixels of a warp
 
 struct View {
     CameraModel<Pair> camera;
+    Outlook<float> outlook;
     GaussianForm form;
     float rim;
     int tiles_x, tiles_y;
 };
 
 inline Vec<float> rounded(Vec<Pair> v) { return {(float)v.x, (float)v.y, (float)v.z}; }
-inline CameraModel<float> rounded(const CameraModel<Pair>& c) {
-    return {{rounded(c.turn.c0), rounded(c.turn.c1), rounded(c.turn.c2)},
-            rounded(c.shift),
-            rounded(c.centre),
-            (float)c.fx,
-            (float)c.fy,
-            (float)c.cx,
-            (float)c.cy,
-            (float)c.near,
-            c.width,
-            c.height};
-}
 
 #ifdef COEFFICIENTS
 // Activated values of splats, as in raster/api.py.

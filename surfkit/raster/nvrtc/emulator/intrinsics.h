@@ -1,7 +1,11 @@
 // CUDA's names for the emulator: qualifiers, vectors, arithmetic, and what warps and blocks do together.
 #pragma once
 
+#include <cfloat>
+
 #include "memory.h"
+
+static_assert(FLT_EVAL_METHOD == 0, "a float is rounded to a float at each step, as on a GPU");
 
 #define __global__
 #define __device__
