@@ -177,6 +177,25 @@ def test_no_pixel_is_lost_at_the_bounds(kind, name):
         assert torch.equal(getattr(bounded.maps, key), value), key
 
 
+@each_kind
+def test_no_pixel_is_lost_of_needles_far_longer_than_the_image(kind):
+    """Their width is the small rest of a difference of squares of their length, here 5000 px at one sigma."""
+    count, side, focal, z = 12, 192, 1000.0, 2.0
+    angle = torch.linspace(0.1, 3.0, count).double()
+    quats = torch.stack([(angle / 2).cos(), 0 * angle, 0 * angle, (angle / 2).sin()], 1)
+    view = Camera(torch.eye(4, dtype=torch.float64), focal, focal, side / 2, side / 2, side, side)
+    draw = Draw(4)
+    centres = torch.cat([0.05 * draw.normal(count, 2), torch.full((count, 1), z).double()], 1)
+    scales = torch.tensor([5000.0, 0.6, 0.6]).double().repeat(count, 1)[:, : 2 if kind == "surfel" else 3] * z / focal
+    given = {"centres": centres, "quats": quats, "scales": scales, "opacities": draw.uniform(0.1, 0.9, count)}
+    made = splats(draw, view, "surfel" if kind == "surfel" else "gaussian", 0, **given)
+    made = made if kind in ("surfel", "gaussian") else replace(made, geometry=kind)
+    bounded, whole = (each.render(made, view, NEAR) for each in (CUDA, Unbounded()))
+    assert (whole.maps.alpha > 0).float().mean() > 0.1
+    for key, value in whole.maps.present().items():
+        assert torch.equal(getattr(bounded.maps, key), value), key
+
+
 def test_pairs_of_floats():
     draw, count = Draw(1), 128
     a, b = draw.normal(2, count) * 10 ** draw.uniform(-6, 6, 2, count)
