@@ -107,7 +107,7 @@ def test_where_splats_are_drawn(kind, name):
     assert len(index) > 250
     shown = shown.take(index)
     centres, axes = turned(shown, view)
-    lens = torch.tensor([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]]).double()
+    lens = torch.tensor([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]], dtype=torch.float64)
     if kind != "surfel":
         at = 24 if kind == "ray" else 17
         true = view.project(shown.means.double())[:, :2].numpy()

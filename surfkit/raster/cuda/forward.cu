@@ -5,12 +5,14 @@ using namespace surfkit;
 
 namespace {
 constexpr int kBatch = 128;  // splats staged together
+// Blocks of a multiprocessor, at least: for all maps of surfels some compilers else take too few registers, and spill.
+constexpr int kBlocks = kKind == kSurfel && LEVEL == kDistortion ? 3 : 1;
 }
 
 // The maps of LEVEL, and what the way back needs: what is left open of each pixel's ray, its last and its median splat,
 // and the moments of distortion. In `blended`, 32 splats of a tile's list share a word for each warp, with a bit for
 // each that was blended into one of the warp's pixels; those of a tile begin at 8 (offsets[tile] / 32 + tile).
-KERNEL(kThreads)
+KERNEL(kThreads, kBlocks)
 forward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries, Buffer<const long long> offsets,
         Buffer<float> color, Buffer<float> alpha, Buffer<float> depth, Buffer<float> median, Buffer<float> normal,
         Buffer<float> distortion, Buffer<float> open, Buffer<int> last, Buffer<int> middle, Buffer<float> shift,
