@@ -5,8 +5,8 @@ using namespace surfkit;
 
 namespace {
 constexpr int kBatch = 128;  // splats staged together
-// Blocks of a multiprocessor, at least: for all maps of surfels some compilers else take too few registers, and spill.
-constexpr int kBlocks = kKind == kSurfel && LEVEL == kDistortion ? 3 : 1;
+// Blocks of a multiprocessor, at least: as many as the registers allow with hardly a spill.
+constexpr int kBlocks = kKind == kSurfel && LEVEL == kDistortion ? 3 : 4;
 }
 
 // The maps of LEVEL, and what the way back needs: what is left open of each pixel's ray, its last and its median splat,
