@@ -347,5 +347,6 @@ def source(name: str, **defines: int) -> CudaSource:
     """The source of NAME.cu for one kind of splats."""
     sizes = {"SplatRecord": RECORD_BYTES[defines["KIND"]], "SplatTint": TINT_BYTES, "Entry": ENTRY_BYTES}
     sizes["TileNumber"] = defines.get("TILE_BYTES", 4)
-    structures = {"View": RasterView, **{name: _raw(name, size) for name, size in sizes.items()}}
+    structures: dict[str, type[ctypes.Structure]] = {"View": RasterView}
+    structures |= {name: _raw(name, size) for name, size in sizes.items()}
     return CudaSource(KERNEL_FOLDER / f"{name}.cu", defines, structures, is_exact=name in ("project", "gather"))
