@@ -144,10 +144,8 @@ def expected(case: Case, gpu: Gpu) -> dict[str, float | int | str]:
 
 PIECE, TILES = (64, 64), 7500
 """Pixels that are emulated, and tiles of 16 x 16 of 1600 x 1200."""
-SORTED = 4 * 2 * (4 + 8) + 4
-"""Bytes of main memory to sort a key of 32 bits with a place of 64: a count, four passes that read and write both."""
-LISTED = 60
-"""Bytes of main memory to bring what was sorted in order."""
+LISTED = 73
+"""Bytes of main memory to list a splat that is seen by its depth."""
 SLOW = {"div": 10, "rcp": 6, "sqrt": 10}
 """Multiply-adds that one of these takes."""
 
@@ -208,11 +206,14 @@ def blending(ptx: str) -> str:
 
 
 def instructions(ptx: str, kind: str) -> int:
-    """Arithmetic of a type in PTX, that which takes longer as often as it does."""
-    found = re.findall(
-        rf"^\s+(add|sub|mul|fma|mad|min|max|abs|neg|div|rcp|sqrt|ex2|lg2|setp|selp)\S*\.{kind}\s", ptx, re.M
-    )
+    """Arithmetic of a type in PTX, that which takes longer as often as it does; signs come with operands."""
+    found = re.findall(rf"^\s+(add|sub|mul|fma|mad|min|max|div|rcp|sqrt|ex2|lg2|setp|selp)\S*\.{kind}\s", ptx, re.M)
     return sum(SLOW.get(name, 1) for name in found)
+
+
+def sorted_bytes(key: int) -> int:
+    """Of main memory, to sort a key of so many bytes with a place of 8: a count, a pass for each that moves both."""
+    return key + key * 2 * (key + 8)
 
 
 def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
@@ -259,9 +260,9 @@ def rasterizer(count: int, gpu: Gpu) -> dict[str, object]:
         }
         limits[name] = max(parts, key=parts.__getitem__)
         times[name] = 1e3 * parts[limits[name]]
-    times["sort"] = 1e3 * (SORTED + LISTED) * (facts["pairs"] + facts["seen"]) / gpu.memory
-    limits["sort"] = "main memory"
-    forward = sum(times[name] for name in ("measure", "sort", "record", "forward"))
+    sorts = facts["pairs"] * sorted_bytes(2) + facts["seen"] * (LISTED + sorted_bytes(4))
+    times["sort"], limits["sort"] = 1e3 * sorts / gpu.memory, "main memory"
+    forward = sum(times[name] for name in ("measure", "record", "sort", "list", "forward"))
     return {
         "seen": round(facts["seen"]),
         "pairs": round(facts["pairs"]),

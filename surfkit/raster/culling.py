@@ -32,14 +32,18 @@ def may_touch(splats: Splats, camera: Camera, near: float) -> Tensor:
     reach = splats.scales.amax(1) * (CUTOFF * (1 + BOUND_ROUNDING))
     if splats.kind == "gaussian" and splats.geometry != "ray":
         return _blurred(splats, splats.means @ pose[:3, :3].T + pose[:3, 3], reach, camera, near)
-    left, top = -SPLAT_MARGIN_PX - camera.cx, -SPLAT_MARGIN_PX - camera.cy
-    right, bottom = camera.width + SPLAT_MARGIN_PX - camera.cx, camera.height + SPLAT_MARGIN_PX - camera.cy
-    # Planes through the camera and the sides of the image, pointing away, and then the depth.
-    away = [[-camera.fx, 0, left], [camera.fx, 0, -right], [0, -camera.fy, top], [0, camera.fy, -bottom]]
-    planes = torch.tensor([*([value / math.hypot(*plane) for value in plane] for plane in away), [0.0, 0.0, 1.0]])
-    planes = planes.to(pose)
+    planes = torch.tensor([*image_sides(camera), [0.0, 0.0, 1.0]]).to(pose)  # the last: the depth
     beyond = torch.addmm(planes @ pose[:3, 3], splats.means, (planes @ pose[:3, :3]).T)
     return (beyond[:, :4] <= reach[:, None]).all(1) & (beyond[:, 4] > (1 - BOUND_ROUNDING) * near)
+
+
+def image_sides(camera: Camera) -> list[list[float]]:
+    """(4, 3): unit normals of the planes through the camera and the sides of the image, a margin away, pointing out;
+    in the camera's frame."""
+    left, top = -SPLAT_MARGIN_PX - camera.cx, -SPLAT_MARGIN_PX - camera.cy
+    right, bottom = camera.width + SPLAT_MARGIN_PX - camera.cx, camera.height + SPLAT_MARGIN_PX - camera.cy
+    away = [[-camera.fx, 0, left], [camera.fx, 0, -right], [0, -camera.fy, top], [0, camera.fy, -bottom]]
+    return [[value / math.hypot(*plane) for value in plane] for plane in away]
 
 
 def boxes_may_touch(boxes: SplatBoxes, camera: Camera, near: float) -> Tensor:

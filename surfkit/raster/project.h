@@ -1,5 +1,5 @@
-// From a splat to its record in one view, and from its color's gradient back; for every backend. In double: the
-// including file gives square_root, natural_log and round_down for it.
+// From a splat to its record in one view, and from its color's gradient back; for every backend. In Real, which the
+// including file gives with its square_root, natural_log and round_down: a double on the CPU, a Pair on a GPU.
 #pragma once
 
 #include "splat_math.h"
@@ -10,19 +10,24 @@ namespace surfkit {
 using splat::Bound;
 using splat::CameraModel;
 using splat::Gaussian;
+using splat::Outline;
 using splat::Posed;
 using splat::SplatGrad;
 using splat::SplatIn;
 using splat::Vec;
+typedef splat::GaussianForm<Real> GaussianForm;
 
 SPLAT_FN int scale_columns(Kind kind) { return kind == kSurfel ? 2 : 3; }
-SPLAT_FN double clamped(double x, double low, double high) { return splat::smallest(splat::largest(x, low), high); }
+template <class R>
+SPLAT_FN R clamped(R x, R low, R high) {
+    return splat::smallest(splat::largest(x, low), high);
+}
 
 // Row i of activated values. `Arrays` has means, quats, scales (2 or 3 columns), opacities, sh and the number of its
 // coefficients.
 template <class Arrays>
-SPLAT_FN SplatIn<double> read_splat(const Arrays& s, long long i, int columns) {
-    SplatIn<double> o{};
+SPLAT_FN SplatIn<Real> read_splat(const Arrays& s, long long i, int columns) {
+    SplatIn<Real> o{};
     o.mean = {s.means[3 * i], s.means[3 * i + 1], s.means[3 * i + 2]};
     for (int k = 0; k < 4; k++) o.quat[k] = s.quats[4 * i + k];
     for (int k = 0; k < columns; k++) o.scale[k] = s.scales[columns * i + k];
@@ -30,93 +35,91 @@ SPLAT_FN SplatIn<double> read_splat(const Arrays& s, long long i, int columns) {
     return o;
 }
 
-SPLAT_FN bool is_finite(double x) { return x - x == 0; }
-
-SPLAT_FN bool valid(const SplatIn<double>& s, int columns) {
-    double sum = s.mean.x + s.mean.y + s.mean.z + s.opacity, turn = 0;
-    bool positive = true;
-    for (double q : s.quat) turn += q * q;
+// Whether all is finite and what must be positive is.
+SPLAT_FN bool valid(const SplatIn<Real>& s, int columns) {
+    const Real turn = s.quat[0] * s.quat[0] + s.quat[1] * s.quat[1] + s.quat[2] * s.quat[2] + s.quat[3] * s.quat[3];
+    const auto lost = [](Real x) { return (float)x - (float)x; };  // 0, or NaN where x is not finite
+    float none = (float)(turn - turn) + lost(s.mean.x) + lost(s.mean.y) + lost(s.mean.z) + lost(s.opacity);
+    bool positive = turn > 0;
     for (int k = 0; k < columns; k++) {
-        sum += s.scale[k];
+        none += lost(s.scale[k]);
         positive = positive && s.scale[k] > 0;
     }
-    return is_finite(sum) && is_finite(turn) && turn > 0 && positive;
+    return none == 0 && positive;
 }
 
-// Colour of a splat seen from the camera, and what its gradient needs.
-struct Shade {
-    splat::Sight<double> sight;
-    double rgb[3];
-};
-template <class Arrays>
-SPLAT_FN Shade shade(const Arrays& s, long long i, const SplatIn<double>& in, const CameraModel<double>& cam) {
-    Shade o{splat::sight(in.mean, cam.centre, s.coefficients), {0.5, 0.5, 0.5}};
+// Colour of a splat, below 0 too.
+template <class Arrays, class R>
+SPLAT_FN void shade(const Arrays& s, long long i, const splat::Sight<R>& sight, R rgb[3]) {
+    for (int c = 0; c < 3; c++) rgb[c] = R(0.5);
     const long long row = 3LL * s.coefficients * i;
     for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) o.rgb[c] += o.sight.basis[k] * s.sh[row + 3 * k + c];
-    return o;
+        for (int c = 0; c < 3; c++) rgb[c] += sight.basis[k] * s.sh[row + 3 * k + c];
 }
-// `out_sh` has the layout of s.sh.
-template <class Arrays, class Out>
-SPLAT_FN void shade_backward(const Arrays& s, long long i, const Shade& o, const double rgb[3], SplatGrad<double>& out,
-                             const Out& out_sh) {
-    double g[3], weight[16] = {};
-    for (int c = 0; c < 3; c++) g[c] = o.rgb[c] > 0 ? rgb[c] : 0;
+
+// How a colour follows its splat: whether each channel is above 0, and if so its gradient by the mean.
+template <class R>
+struct Tint {
+    Vec<R> by_mean[3];
+    bool is_lit[3];
+};
+template <class Arrays, class R>
+SPLAT_FN Tint<R> tint(const Arrays& s, long long i, const splat::Sight<R>& sight, const R rgb[3]) {
+    Tint<R> o{};
     const long long row = 3LL * s.coefficients * i;
-    for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) {
-            out_sh[row + 3 * k + c] = (float)(g[c] * o.sight.basis[k]);
-            weight[k] += g[c] * s.sh[row + 3 * k + c];
-        }
-    if (s.coefficients > 1 && o.sight.length > 0)
-        out.mean = out.mean + splat::sight_backward(o.sight, s.coefficients, weight);
+    for (int c = 0; c < 3; c++) {
+        o.is_lit[c] = rgb[c] > 0;
+        if (!o.is_lit[c] || s.coefficients == 1 || !(sight.length > 0)) continue;
+        R by_basis[16];
+        for (int k = 0; k < s.coefficients; k++) by_basis[k] = s.sh[row + 3 * k + c];
+        o.by_mean[c] = splat::sight_backward(sight, s.coefficients, by_basis);
+    }
+    return o;
 }
 
 // A little larger than exact, so that the float32 row test never loses a pixel.
-SPLAT_FN Bound<double> widened(Bound<double> b) {
-    const double more = 1.0001, pad = 1e-3;
+SPLAT_FN Bound<Real> widened(Bound<Real> b) {
+    const Real more = 1.0001, pad = 1e-3;
     b.hxx = b.hxx * more + pad;
     b.hxy *= more;
     b.hyy = b.hyy * more + pad;
     if (b.r2 > 0) {
         b.r2 = b.r2 * more + pad;
-        // A disc inside the ellipse says nothing new.
-        const double half = (b.hxx + b.hyy) / 2,
-                     spread = square_root((b.hxx - b.hyy) * (b.hxx - b.hyy) / 4 + b.hxy * b.hxy);
-        if (half > spread &&
-            square_root(half - spread) >
-                square_root(b.r2) + square_root((b.dx - b.mx) * (b.dx - b.mx) + (b.dy - b.my) * (b.dy - b.my)))
+        // A disc inside the ellipse says nothing new. The share of `half` is more than a float loses in the difference.
+        const auto hxx = rough(b.hxx), hxy = rough(b.hxy), hyy = rough(b.hyy), dx = rough(b.dx - b.mx),
+                   dy = rough(b.dy - b.my), half = (hxx + hyy) / 2, share = half / (1 << 20),
+                   spread = square_root((hxx - hyy) * (hxx - hyy) / 4 + hxy * hxy) + share;
+        if (half > spread && square_root(half - spread) > square_root(rough(b.r2)) + square_root(dx * dx + dy * dy))
             b.r2 = -1;
     }
     return b;
 }
 
 template <class Record>
-SPLAT_FN void fill_bound(Record& r, const Bound<double>& b) {
-    const double tilt = b.hxy / b.hyy, ax = r.ax, ay = r.ay;
+SPLAT_FN void fill_bound(Record& r, const Bound<Real>& b) {
+    const Real tilt = b.hxy / b.hyy, ax = r.ax, ay = r.ay;
     r.mx = (float)(b.mx - ax);
     r.my = (float)(b.my - ay);
     r.tilt = (float)tilt;
-    r.wide = (float)splat::largest(b.hxx - b.hxy * tilt, 0.0);
+    r.wide = (float)splat::largest(b.hxx - b.hxy * tilt, Real(0));
     r.flat = (float)(1 / b.hyy);
     r.disc_x = (float)(b.dx - ax);
     r.disc_y = (float)(b.dy - ay);
     r.disc_r2 = (float)b.r2;
 }
 template <class Record>
-SPLAT_FN void fill_look(Record& r, double opacity, const Shade& look, Vec<double> normal) {
+SPLAT_FN void fill_look(Record& r, Real opacity, Vec<Real> normal) {
     r.opacity = (float)opacity;
-    for (int c = 0; c < 3; c++) r.color[c] = (float)splat::largest(look.rgb[c], 0.0);
     r.normal[0] = (float)normal.x;
     r.normal[1] = (float)normal.y;
     r.normal[2] = (float)normal.z;
 }
 
-SPLAT_FN void fill_record(SurfelRecord& r, double opacity, const splat::SurfelView<double>& s) {
+SPLAT_FN void fill_record(SurfelRecord& r, Real opacity, const splat::SurfelView<Real>& s) {
     r.ax = (float)s.ax;
     r.ay = (float)s.ay;
-    const Vec<double> m[3] = {s.a, s.b, s.c};
-    double* to[3] = {r.a, r.b, r.c};
+    const Vec<Real> m[3] = {s.a, s.b, s.c};
+    Real* to[3] = {r.a, r.b, r.c};
     for (int k = 0; k < 3; k++) {
         to[k][0] = m[k].x;
         to[k][1] = m[k].y;
@@ -125,13 +128,13 @@ SPLAT_FN void fill_record(SurfelRecord& r, double opacity, const splat::SurfelVi
     r.det = (float)s.det;
     r.z_low = (float)s.z_low;
     r.z_high = (float)s.z_high;
-    fill_look(r, opacity, Shade{}, s.normal);
+    fill_look(r, opacity, s.normal);
     for (int k = 0; k < 6; k++) r.signal_x[k] = (float)s.signal.x[k];
     for (int k = 0; k < 3; k++) r.signal_y[k] = (float)s.signal.y[k == 2 ? 4 : 2 * k + 1];
 }
-SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, const splat::GaussianForm&,
-                          SurfelRecord& r, Bound<double>& bound) {
-    splat::SurfelView<double> s;
+SPLAT_FN bool project_one(const SplatIn<Real>& in, const CameraModel<Real>& cam, const GaussianForm&,
+                          SurfelRecord& r, Bound<Real>& bound) {
+    splat::SurfelView<Real> s;
     if (!splat::surfel_view(in, cam, s)) return false;
     bound = s.bound;
     fill_record(r, in.opacity, s);
@@ -139,9 +142,10 @@ SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& 
 }
 // What both records of gaussians have.
 template <class Record>
-SPLAT_FN void fill_footprint(Record& r, const Gaussian<double>& g) {
-    const double limit = 1 << 22, ax = round_down(clamped(g.x, -limit, limit)) + 0.5,
-                 ay = round_down(clamped(g.y, -limit, limit)) + 0.5;
+SPLAT_FN void fill_footprint(Record& r, const Gaussian<Real>& g) {
+    const auto limit = rough(Real(1 << 22)), near_x = rough(g.x), near_y = rough(g.y);
+    const Real ax = round_down(clamped(near_x, -limit, limit)) + Real(0.5),
+               ay = round_down(clamped(near_y, -limit, limit)) + Real(0.5);
     r.x = (float)(g.x - ax);
     r.y = (float)(g.y - ay);
     r.l00 = (float)g.l00;
@@ -153,22 +157,22 @@ SPLAT_FN void fill_footprint(Record& r, const Gaussian<double>& g) {
     r.ax = (float)ax;
     r.ay = (float)ay;
 }
-SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, const splat::GaussianForm& form,
-                          GaussianRecord& r, Bound<double>& bound) {
-    const Posed<double> p = splat::pose(in, cam);
-    Gaussian<double> g;
+SPLAT_FN bool project_one(const SplatIn<Real>& in, const CameraModel<Real>& cam, const GaussianForm& form,
+                          GaussianRecord& r, Bound<Real>& bound) {
+    const Posed<Real> p = splat::pose(in, cam);
+    Gaussian<Real> g;
     if (!splat::gaussian_project(in, p, cam, form, g)) return false;
     bound = g.bound;
     fill_footprint(r, g);
     r.slope_x = (float)g.slope_x;
     r.slope_y = (float)g.slope_y;
-    fill_look(r, in.opacity * g.compensation, Shade{}, g.normal);
+    fill_look(r, in.opacity * g.compensation, g.normal);
     return true;
 }
-SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, const splat::GaussianForm& form,
-                          RayRecord& r, Bound<double>& bound) {
-    const Posed<double> p = splat::pose(in, cam);
-    Gaussian<double> g;
+SPLAT_FN bool project_one(const SplatIn<Real>& in, const CameraModel<Real>& cam, const GaussianForm& form,
+                          RayRecord& r, Bound<Real>& bound) {
+    const Posed<Real> p = splat::pose(in, cam);
+    Gaussian<Real> g;
     if (!splat::gaussian_project(in, p, cam, form, g)) return false;
     bound = g.bound;
     fill_footprint(r, g);
@@ -176,7 +180,7 @@ SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& 
     r.bend_y = (float)(-g.slope_y / g.z);
     r.kappa = (float)g.kappa;
     r.opacity = (float)in.opacity;
-    const Vec<double> m[3] = {g.steep, g.steep_x, g.steep_y};
+    const Vec<Real> m[3] = {g.steep, g.steep_x, g.steep_y};
     float* to[3] = {r.steep, r.steep_x, r.steep_y};
     for (int k = 0; k < 3; k++) {
         to[k][0] = (float)m[k].x;
@@ -186,59 +190,69 @@ SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& 
     return true;
 }
 
-// What a camera sees, for leaving out early what lies well outside: in a large scene that is nearly everything.
-struct Outlook {
-    static constexpr double kMargin = 3;  // pixels; the low-pass filter of a surfel reaches 2.36
-    const CameraModel<double>& cam;
-    Vec<double> side[4];  // unit normals of the planes through the camera and the sides of the image, pointing away
+template <class R>
+SPLAT_FN R largest_scale(const SplatIn<R>& s) {
+    return splat::largest(s.scale[0], splat::largest(s.scale[1], s.scale[2]));
+}
 
-    explicit Outlook(const CameraModel<double>& camera) : cam(camera) {
-        const double left = -kMargin - cam.cx, right = cam.width + kMargin - cam.cx, top = -kMargin - cam.cy,
-                     bottom = cam.height + kMargin - cam.cy;
-        const Vec<double> away[4] = {{-cam.fx, 0, left}, {cam.fx, 0, -right}, {0, -cam.fy, top}, {0, cam.fy, -bottom}};
+// What a camera sees, for leaving out early what lies well outside: in a large scene that is nearly everything. A float
+// is exact enough: kMargin is more than what it loses.
+template <class R>
+struct Outlook {
+    static constexpr float kMargin = 3;  // pixels; the low-pass filter of a surfel reaches 2.36
+    CameraModel<R> cam;
+    Vec<R> side[4];  // unit normals of the planes through the camera and the sides of the image, pointing away
+
+    Outlook() = default;
+    explicit Outlook(const CameraModel<R>& camera) : cam(camera) {
+        const R margin = kMargin, none = 0, left = -margin - cam.cx, right = cam.width + margin - cam.cx,
+                top = -margin - cam.cy, bottom = cam.height + margin - cam.cy;
+        const Vec<R> away[4] = {
+            {-cam.fx, none, left}, {cam.fx, none, -right}, {none, -cam.fy, top}, {none, cam.fy, -bottom}};
         for (int k = 0; k < 4; k++) side[k] = (1 / square_root(splat::dot(away[k], away[k]))) * away[k];
     }
 
-    // Whether a splat with its centre at c in the camera frame surely touches no pixel.
-    bool misses(Kind kind, const SplatIn<double>& in, Vec<double> c) const {
-        if (!(c.z > cam.near)) return true;
-        const double reach = splat::largest(in.scale[0], splat::largest(in.scale[1], in.scale[2])) *
-                             square_root(splat::kCutoffSquared) * 1.0001;
+    // Whether a splat of so large a scale with its centre at c in the camera frame surely touches no pixel.
+    bool misses(Kind kind, R scale, Vec<R> c) const {
+        if (c.z < cam.near) return true;
+        const R reach = scale * square_root(R(splat::kCutoffSquared)) * R(1.0001);
         if (kind == kGaussian) return misses_blurred(reach, c);
-        for (const Vec<double>& away : side)
+        for (const Vec<R>& away : side)
             if (splat::dot(away, c) > reach) return true;
         return false;
     }
 
   private:
     // The footprint of a gaussian is affine in its covariance, at a slope that is held near the image.
-    bool misses_blurred(double reach, Vec<double> c) const {
-        const auto apart = [&](double slope, double f, double principal, int pixels) {
-            const double more = 0.15 * pixels / f,
-                         held = clamped(slope, -principal / f - more, (pixels - principal) / f + more);
-            const double half = f / c.z * reach * square_root(1 + held * held) + 2 + kMargin,
-                         at = f * slope + principal;
+    bool misses_blurred(R reach, Vec<R> c) const {
+        const auto apart = [&](R slope, R f, R principal, int pixels) {
+            const R more = R(0.15) * pixels / f,
+                    held = clamped(slope, -principal / f - more, (pixels - principal) / f + more);
+            const R half = f / c.z * reach * square_root(1 + held * held) + 2 + kMargin, at = f * slope + principal;
             return at + half < 0 || at - half > pixels;
         };
         return apart(c.x / c.z, cam.fx, cam.cx, cam.width) || apart(c.y / c.z, cam.fy, cam.cy, cam.height);
     }
 };
 
-// Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + rim ... 16 t + 16 - rim with
-// a rim of 0.5; with none, what lies between them too.
-template <class F>
-SPLAT_FN void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double rim, F f) {
-    const auto first = [&](double low, int tiles) {
-        return (int)clamped(-round_down(-((low + rim) / kTile - 1)), 0.0, (double)tiles);
+// Calls f(tile) for the tiles that a bound touches, which is about the point (ax, ay). Tile t holds the pixel centres
+// 16 t + rim ... 16 t + 16 - rim with a rim of 0.5; with none, what lies between them too.
+template <class R, class F>
+SPLAT_FN void each_tile(const Bound<R>& b, const Outline<R>& o, R ax, R ay, int tiles_x, int tiles_y, R rim, F f) {
+    // The point's tile apart, which is exact: only the rest is rounded.
+    const auto first = [&](R low, R from, int tiles) {
+        const R tile = round_down(from / kTile), rest = low + (from - tile * kTile);
+        return (int)clamped(tile - round_down(-((rest + rim) / kTile - 1)), R(0), R(tiles));
     };
-    const auto end = [&](double high, int tiles) {
-        return (int)clamped(round_down((high - rim) / kTile) + 1, 0.0, (double)tiles);
+    const auto end = [&](R high, R from, int tiles) {
+        const R tile = round_down(from / kTile), rest = high + (from - tile * kTile);
+        return (int)clamped(tile + round_down((rest - rim) / kTile) + 1, R(0), R(tiles));
     };
-    const double disc = b.r2 > 0 ? square_root(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
-    const double hx = square_root(b.hxx), hy = square_root(b.hyy);
-    const double x0 = splat::smallest(b.mx - hx, dx - disc), x1 = splat::largest(b.mx + hx, dx + disc),
-                 y0 = splat::smallest(b.my - hy, dy - disc), y1 = splat::largest(b.my + hy, dy + disc);
-    const int left = first(x0, tiles_x), right = end(x1, tiles_x), top = first(y0, tiles_y), bottom = end(y1, tiles_y);
+    const R disc = b.r2 > 0 ? square_root(b.r2) : R(0), dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
+    const R x0 = splat::smallest(b.mx - o.hx, dx - disc), x1 = splat::largest(b.mx + o.hx, dx + disc),
+            y0 = splat::smallest(b.my - o.hy, dy - disc), y1 = splat::largest(b.my + o.hy, dy + disc);
+    const int left = first(x0, ax, tiles_x), right = end(x1, ax, tiles_x), top = first(y0, ay, tiles_y),
+              bottom = end(y1, ay, tiles_y);
     if (left >= right) return;
     // Most splats are small. In a single row or column their box tells all, but for what lies between pixel centres.
     // Large ones may be single only because the image ends there; of these the box holds far too much.
@@ -248,24 +262,23 @@ SPLAT_FN void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double
             for (int x = left; x < right; x++) f(y * tiles_x + x);
         return;
     }
-    const splat::Outline<double> o = splat::outline(b);
     for (int y = top; y < bottom; y++) {
-        double low, high;
-        if (!splat::bound_span(b, o, y * kTile + rim, (y + 1) * kTile - rim, low, high)) continue;
-        const int last = end(high, tiles_x);
-        for (int x = first(low, tiles_x); x < last; x++) f(y * tiles_x + x);
+        R low, high;
+        if (!splat::bound_span(b, o, y * kTile - ay + rim, (y + 1) * kTile - ay - rim, low, high)) continue;
+        const int last = end(high, ax, tiles_x);
+        for (int x = first(low, ax, tiles_x); x < last; x++) f(y * tiles_x + x);
     }
 }
 
 // What the pixels' sums mean, by kind, as cotangents of what splat_math.h projects.
-SPLAT_FN splat::SurfelSums<double> surfel_sums(const double* s) {
+SPLAT_FN splat::SurfelSums<Real> surfel_sums(const Real* s) {
     return {
         {s[0], s[1], s[2]}, {s[3], s[4], s[5]}, {s[6], s[7], s[8]}, s[9], {s[10], s[11]}, {s[12], s[13], s[14]}, s[15]};
 }
-SPLAT_FN splat::GaussianSums<double> gaussian_sums(const double* s) {
+SPLAT_FN splat::GaussianSums<Real> gaussian_sums(const Real* s) {
     return {s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], {s[8], s[9], s[10]}, s[11], s[5]};
 }
-SPLAT_FN splat::RaySums<double> ray_sums(const double* s) {
+SPLAT_FN splat::RaySums<Real> ray_sums(const Real* s) {
     return {s[0],
             s[1],
             s[2],
@@ -283,16 +296,16 @@ SPLAT_FN splat::RaySums<double> ray_sums(const double* s) {
 }
 
 // dL/d(splat) but for its color, from the sums over its pixels.
-SPLAT_FN SplatGrad<double> splat_backward(Kind kind, const SplatIn<double>& in, const CameraModel<double>& cam,
-                                          const splat::GaussianForm& form, const double* s) {
-    SplatGrad<double> g;
+SPLAT_FN SplatGrad<Real> splat_backward(Kind kind, const SplatIn<Real>& in, const CameraModel<Real>& cam,
+                                          const GaussianForm& form, const Real* s) {
+    SplatGrad<Real> g;
     if (kind == kSurfel) {
         splat::surfel_gradient(in, cam, surfel_sums(s), g);
     } else {
-        const Posed<double> p = splat::pose(in, cam);
-        Gaussian<double> o;
+        const Posed<Real> p = splat::pose(in, cam);
+        Gaussian<Real> o;
         splat::gaussian_project(in, p, cam, form, o);
-        const splat::RaySums<double> ray = ray_sums(s);
+        const splat::RaySums<Real> ray = ray_sums(s);
         const bool rays = kind == kGaussianRay;
         splat::gaussian_backward(in, p, cam, form, o, rays ? splat::plane_sums(o, ray) : gaussian_sums(s),
                                  rays ? &ray : nullptr, g);

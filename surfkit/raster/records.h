@@ -1,4 +1,5 @@
-// What blending needs of one splat in one view, by its kind; for every backend.
+// What blending needs of one splat in one view, by its kind; for every backend. The including file gives Real: a number
+// more exact than float.
 #pragma once
 
 namespace surfkit {
@@ -18,7 +19,7 @@ constexpr int kRaySums = 24, kRaySumsChosen = 28;
 
 // What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
 struct alignas(64) SurfelRecord {
-    double a[3], b[3], c[3];  // double so that the origin moves to each tile without loss
+    Real a[3], b[3], c[3];  // so exact that the origin moves to each tile without loss
     float det, z_low, z_high;
     float opacity, color[3], normal[3];
     float ax, ay;

@@ -1,11 +1,12 @@
 // The formulas of splatting, once, for every backend. Plain C++17, no includes: the CPU backend instantiates them with
-// double or vectors of them (per splat) and SIMD vectors (per pixel); a CUDA backend can instantiate them with float.
+// double or vectors of them (per splat) and SIMD vectors (per pixel), the CUDA backend with pairs of floats and floats.
 //
 // Per pixel, V is a float or a vector of floats and the including file provides, for V and its mask type:
 //   madd(a, b, c) = a b + c rounded once where the machine can, reciprocal(a), lesser(a, b), less_equal(a, b),
 //   select(mask, a, b), operator& on masks.
-// Per splat, R is a double or, for surfels on the CPU, several, and the including file provides `square_root`,
-// `natural_log` and `round_down` for it.
+// Per splat, R is a double or, for surfels on the CPU, several, or a Pair on a GPU, and the including file provides
+// `square_root`, `natural_log` and `round_down` for it, and `rough`: the same as a number that is cheaper, where there is
+// one, for what need not be exact.
 #pragma once
 
 #ifndef SPLAT_FN
@@ -183,18 +184,17 @@ SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
     return g;
 }
 
-// The direction in which a splat is seen, how far away it is, and the harmonics there.
+// The direction in which a splat is seen that lies at d from the camera, how far away it is, and the harmonics there.
 template <class R>
 struct Sight {
     Vec<R> direction;
     R length, basis[16];
 };
 template <class R>
-SPLAT_FN Sight<R> sight(Vec<R> mean, Vec<R> eye, int count) {
+SPLAT_FN Sight<R> sight(Vec<R> d, int count) {
     Sight<R> o;
-    const Vec<R> d = mean - eye;
     o.length = square_root(dot(d, d));
-    o.direction = (R(1) / largest(o.length, R(1e-300))) * d;
+    o.direction = (R(1) / largest(o.length, R(1e-30))) * d;
     sh_basis(o.direction, count, o.basis);
     return o;
 }
@@ -232,6 +232,12 @@ struct Bound {
     R mx, my, hxx, hxy, hyy;
     R dx, dy, r2;
 };
+
+// The squared distance in sigmas at which an opacity falls to kAlphaMin, and a little more.
+template <class R>
+SPLAT_FN auto cutoff(R opacity) {
+    return 2 * natural_log(rough(opacity / R(kAlphaMin))) * rough(R(1.00001)) + rough(R(1e-5));
+}
 
 // Camera-frame quantities that the forward and the backward of both kinds share.
 template <class R>
@@ -314,8 +320,8 @@ SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     Contour<R> edge;
     const auto in_front = (p.c.z > cam.near) & (s.opacity > R(kAlphaMin)) & contour(o.h, R(kCutoffSquared), edge) &
                           contour(o.h, R(9), o.low);
-    const R k2 = smallest(2 * natural_log(s.opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5), R(kCutoffSquared));
-    const auto bounded = contour(o.h, k2, edge);
+    const auto k2 = smallest(cutoff(s.opacity), rough(R(kCutoffSquared)));
+    const auto bounded = contour(o.h, R(k2), edge);
     o.bound = {edge.x,
                edge.y,
                edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
@@ -324,20 +330,20 @@ SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
                o.low.x,
                o.low.y,
                k2 / 2};
-    const R limit = R(1 << 22);
-    o.ax = round_down(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
-    o.ay = round_down(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
+    const auto limit = rough(R(1 << 22)), near_x = rough(o.low.x), near_y = rough(o.low.y);
+    o.ax = round_down(smallest(largest(near_x, -limit), limit)) + R(0.5);
+    o.ay = round_down(smallest(largest(near_y, -limit), limit)) + R(0.5);
     const Vec<R> u = o.h.u - o.ax * o.h.w, v = o.h.v - o.ay * o.h.w;
     const Vec<R> a = cross(v, o.h.w), b = cross(o.h.w, u), c = cross(u, v);
-    R size = 0;
+    auto size = rough(R(0));
     const Vec<R> columns[3] = {a, b, c};
     for (const Vec<R>& q : columns)
-        size = largest(size, largest(magnitude(q.x), largest(magnitude(q.y), magnitude(q.z))));
+        size = largest(size, largest(magnitude(rough(q.x)), largest(magnitude(rough(q.y)), magnitude(rough(q.z)))));
     o.unit = size;
-    o.a = (1 / size) * a;
-    o.b = (1 / size) * b;
-    o.c = (1 / size) * c;
-    o.det = dot(u, a) / size;
+    o.a = (1 / o.unit) * a;
+    o.b = (1 / o.unit) * b;
+    o.c = (1 / o.unit) * c;
+    o.det = dot(u, a) / o.unit;
     // Seen edge-on, rays and disc share a plane and do not meet in a point: only the low-pass filter draws.
     const R lean = dot(p.axes.c2, p.c), none = R(0), one = R(1);
     const auto edge_on = lean * lean < R(kEdgeOn * kEdgeOn) * dot(p.c, p.c);
@@ -349,7 +355,7 @@ SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     o.z_low = largest(p.c.z - reach, cam.near);
     o.z_high = p.c.z + reach;
     o.flip = either(lean > none, R(-1), one);
-    return in_front & bounded & (size > none);
+    return in_front & bounded & (o.unit > none);
 }
 
 // How what one pixel hands back becomes its share of the screen-space gradient, in both directions: factors of q0 Y
@@ -437,8 +443,9 @@ SPLAT_FN void surfel_gradient(const SplatIn<R>& s, const CameraModel<R>& cam, co
 // ---- gaussians
 
 // How gaussians are evaluated.
+template <class R>
 struct GaussianForm {
-    double dilation;      // px^2, added to the footprint, which makes it at least about a pixel wide; not along rays
+    R dilation;           // px^2, added to the footprint, which makes it at least about a pixel wide; not along rays
     bool is_compensated;  // whether the opacity is lowered by what that adds to the footprint
     Geometry geometry;
 };
@@ -516,7 +523,7 @@ SPLAT_FN bool ray_project(const SplatIn<R>& s, const Posed<R>& p, const CameraMo
 }
 
 template <class R>
-SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm& form,
+SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm<R>& form,
                                Gaussian<R>& o) {
     const Vec<R> c = p.c;
     if (!(c.z > cam.near)) return false;
@@ -546,7 +553,7 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     o.raw[0] = xx;
     o.raw[1] = yy;
     const R raw_det = rays ? ray_footprint(s, p, cam, dx, dy) : largest(xx * yy - xy * xy, R(0));
-    const R dilation = rays ? R(0) : R(form.dilation);
+    const R dilation = rays ? R(0) : form.dilation;
     xx += dilation;
     yy += dilation;
     o.cov[0] = xx;
@@ -565,7 +572,7 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     o.l00 = square_root(yy / det);
     o.l01 = -xy / det / o.l00;
     o.l11 = 1 / square_root(yy);
-    const R k2 = 2 * natural_log(opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5);
+    const R k2 = cutoff(opacity);
     o.bound = {o.x, o.y, k2 * xx, k2 * xy, k2 * yy, o.x, o.y, R(-1)};
     // Depth of the largest density along the ray, to first order about the centre (RaDe-GS).
     R q = 0;
@@ -632,7 +639,7 @@ SPLAT_FN GaussianSums<R> plane_sums(const Gaussian<R>& o, const RaySums<R>& g) {
 }
 
 template <class R>
-SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm& form,
+SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm<R>& form,
                                 const Gaussian<R>& o, const GaussianSums<R>& g, const RaySums<R>* ray,
                                 SplatGrad<R>& out) {
     const Vec<R> c = p.c;

@@ -30,9 +30,9 @@ MISTAKES = {
     "no barrier before the next batch": ("backward", BARRIER, "", 2, "with no barrier"),
     "front to back": ("backward", "31 - __clz(todo)", "__ffs(todo) - 1", 0, "wrong"),
     "a lane that stays away from a shuffle": (
-        "backward", "const float sum = warp_sums", "if (lane == 7) continue; const float sum = warp_sums", 0, "shfl",
+        "backward", "const int column = fold", "if (lane == 7) continue; const int column = fold", 0, "shfl",
     ),
-    "moments about the tile": ("backward", "sum += (column < 3", "if (false) sum += (column < 3", 0, "wrong"),
+    "moments about the tile": ("backward", "if (is_moment) sum +=", "if (false) sum +=", 0, "wrong"),
     "one slot too many": ("gather", "slot < first[r + 1]", "slot <= first[r + 1]", 0, "index .* which has|wrong"),
     "no atomic": ("project", "atomicMin(&invalid[0], i)", "invalid[0] = i", 0, "wrong|another block|with no barrier"),
 }  # fmt: skip

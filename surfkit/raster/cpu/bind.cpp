@@ -95,7 +95,7 @@ void add_raster(nb::module_& m) {
                  const auto s = arrays(splats);
                  const auto c = camera(pose, lens, width, height, near);
                  nb::gil_scoped_release free;
-                 const splat::GaussianForm form{dilation, antialias, (splat::Geometry)geometry};
+                 const GaussianForm form{dilation, antialias, (splat::Geometry)geometry};
                  new (self) Pass(kind_of(surfel, form.geometry), s, c, form, rim, threads, seen.data(), radii.data());
              })
         .def_ro("first_invalid", &Pass::first_invalid)

@@ -42,7 +42,7 @@ SURFKIT_INLINE splat::Sight<Wide> sight_of_some(const SplatArrays& s, const int6
         for (int k = 0; k < 3; k++) all[k][lane] = s.means[3 * rows[std::min(lane, some - 1)] + k];
     splat::Vec<Wide> mean;
     std::memcpy(&mean, all, sizeof all);
-    const splat::Sight<Wide> o = splat::sight(mean, cam.centre, s.coefficients);
+    const splat::Sight<Wide> o = splat::sight(mean - cam.centre, s.coefficients);
     std::memcpy(basis, o.basis, s.coefficients * sizeof(Wide));
     return o;
 }

@@ -439,7 +439,7 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
 
 int tiles(const splat::Bound<double>& bound, int tiles_x, int tiles_y, double rim, uint32_t* to) {
     int count = 0;
-    each_tile(bound, tiles_x, tiles_y, rim, [&](int tile) { to[count++] = (uint32_t)tile; });
+    each_tile(bound, splat::outline(bound), 0.0, 0.0, tiles_x, tiles_y, rim, [&](int tile) { to[count++] = (uint32_t)tile; });
     return count;
 }
 

@@ -3,6 +3,7 @@
 
 #include <cstdint>
 
+#include "doubles.h"
 #include "../records.h"
 #include "../splat_math.h"
 

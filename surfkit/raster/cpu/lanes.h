@@ -59,6 +59,7 @@ SURFKIT_INLINE static Wide round_down(Wide a) {
     return of_each<std::floor>(a);
 #endif
 }
+SURFKIT_INLINE static Wide rough(Wide a) { return a; }
 SURFKIT_INLINE static Wide natural_log(Wide a) { return of_each<std::log>(a); }
 
 // The first `count` lanes of a struct of numbers; `From` is the same of Wide as `To` of doubles.

@@ -39,7 +39,7 @@ std::vector<uint32_t> order_of(const std::vector<float>& keys) {
 }
 
 // Rows of the splats of a chunk that may touch a pixel; their number. The first that is not valid is told.
-int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outlook& outlook, int64_t* rows,
+int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outlook<double>& outlook, int64_t* rows,
                   int64_t& invalid, bool* seen, float* radii) {
     const int columns = scale_columns(kind);
     int64_t count = 0;
@@ -49,7 +49,7 @@ int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outl
         const SplatIn<double> in = read_splat(splats, i, columns);
         if (!valid(in, columns)) {
             if (invalid < 0) invalid = i;
-        } else if (!outlook.misses(kind, in, splat::mul(outlook.cam.turn, in.mean) + outlook.cam.shift)) {
+        } else if (!outlook.misses(kind, largest_scale(in), splat::mul(outlook.cam.turn, in.mean) + outlook.cam.shift)) {
             rows[count++] = i;
         }
     }
@@ -58,13 +58,13 @@ int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outl
 
 template <class Record>
 void project_some(const SplatArrays& splats, const int64_t* rows, int64_t count, const CameraModel<double>& camera,
-                  const splat::GaussianForm& form, Record* records, Bound<double>* bounds, bool* drawn) {
+                  const GaussianForm& form, Record* records, Bound<double>* bounds, bool* drawn) {
     for (int64_t k = 0; k < count; k++)
         drawn[k] = project_one(read_splat(splats, rows[k], 3), camera, form, records[k], bounds[k]);
 }
 
 void project_some(const SplatArrays& splats, const int64_t* rows, int64_t count, const CameraModel<double>& camera,
-                  const splat::GaussianForm&, SurfelRecord* records, Bound<double>* bounds, bool* drawn) {
+                  const GaussianForm&, SurfelRecord* records, Bound<double>* bounds, bool* drawn) {
     splat::SurfelView<double> views[kGroup];
     kernels().project_surfels(splats, rows, count, camera, views, drawn);
     for (int64_t k = 0; k < count; k++) {
@@ -83,7 +83,7 @@ void Pass::each_seen(int threads, F f) const {
     });
 }
 
-Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, const splat::GaussianForm& form,
+Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, const GaussianForm& form,
            double rim, int threads, bool* seen, float* radii)
     : kind_(kind),
       camera_(camera),
@@ -110,7 +110,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
     seen_in_.assign(chunks, 0);
     Record* records = (Record*)records_.get();
     std::vector<int64_t> invalid(chunks, -1);
-    const Outlook outlook(camera_);
+    const Outlook<double> outlook(camera_);
     const Kernels& kernel = kernels();
     parallel(chunks, threads, [&](int64_t c) {
         int64_t at = c * kChunk;
@@ -261,7 +261,7 @@ Layout layout(Kind kind) {
 
 // dL/d(splat) but for its colour of some rows, from their sums, `stride` numbers apart.
 void gradients_of(Kind kind, const SplatArrays& splats, const int64_t* rows, int64_t count,
-                  const CameraModel<double>& camera, const splat::GaussianForm& form, const double* sums, int stride,
+                  const CameraModel<double>& camera, const GaussianForm& form, const double* sums, int stride,
                   SplatGrad<double>* out) {
     if (kind == kSurfel) return kernels().surfels_backward(splats, rows, count, camera, sums, stride, out);
     for (int64_t k = 0; k < count; k++)
@@ -393,13 +393,13 @@ void Pass::probe(const double* points, int64_t count, float* opacity, int thread
 
 void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, int threads, bool* found) {
     const int columns = scale_columns(kind);
-    const Outlook outlook(camera);
+    const Outlook<double> outlook(camera);
     parallel(chunks_of(splats.count, kChunk), threads, [&](int64_t c) {
         for (int64_t i = c * kChunk; i < std::min(splats.count, (c + 1) * kChunk); i++) {
             SplatIn<double> in{};
             in.mean = {splats.means[3 * i], splats.means[3 * i + 1], splats.means[3 * i + 2]};
             for (int k = 0; k < columns; k++) in.scale[k] = splats.scales[columns * i + k];
-            found[i] = !outlook.misses(kind, in, splat::mul(camera.turn, in.mean) + camera.shift);
+            found[i] = !outlook.misses(kind, largest_scale(in), splat::mul(camera.turn, in.mean) + camera.shift);
         }
     });
 }

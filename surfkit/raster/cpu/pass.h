@@ -19,7 +19,7 @@ class Pass {
   public:
     // Projects and bins. `seen` and `radii` are written for every splat. `rim`: 0.5 if pixel centres are to be drawn, 0
     // if anything between them.
-    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, const splat::GaussianForm& form,
+    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, const GaussianForm& form,
          double rim, int threads, bool* seen, float* radii);
 
     void forward(Level level, const Planes& out, int threads);
@@ -46,7 +46,7 @@ class Pass {
 
     Kind kind_;
     splat::CameraModel<double> camera_;
-    splat::GaussianForm form_;
+    GaussianForm form_;
     double rim_;
     int64_t count_;
     int tiles_x_, tiles_y_;

@@ -87,7 +87,7 @@ void ray_opacity(const SplatArrays& splats, const CameraModel<double>& cam, cons
         for (int64_t i = c * kChunk; i < std::min(splats.count, (c + 1) * kChunk); i++) {
             splat::Bound<double> bound;
             if (!cast(splats, i, cam, rays[i], bound)) continue;
-            each_tile(bound, tiles_x, tiles_y, 0.0, [&](uint32_t tile) {
+            each_tile(bound, splat::outline(bound), 0.0, 0.0, tiles_x, tiles_y, 0.0, [&](uint32_t tile) {
                 if (!inside[tile].empty()) found.push_back({tile, (uint32_t)i});
             });
         }

@@ -31,27 +31,21 @@ inline void read_cotangents(const Given& from, const Pixel& p, float open, Cotan
     if (level >= kDistortion) to.bend = plane_at(from.distortion, p.at);
 }
 
-// Adds to the lanes with a 0 in the bit `half` of their number the first values of those with a 1, and the other way
-// round the second.
-template <int half>
-inline void fold(float* v, int lane) {
-    const bool is_upper = lane & half;
+// Adds to the lanes with a 0 in the bit `bit` of their number the first half of the values of those with a 1, and the
+// other way round the second; and so on with the halves. Gives which of the values, whose sum is then v[0], is the
+// lane's: `count` or more if none is.
+template <int count, int bit = 16>
+inline int fold(float* v, int lane) {
+    constexpr int half = (count + 1) / 2;
+    const bool is_upper = lane & bit;
 #pragma unroll
     for (int i = 0; i < half; i++) {
-        const float first = v[i], second = v[i + half];
-        v[i] = (is_upper ? second : first) + __shfl_xor_sync(kAllLanes, is_upper ? first : second, half);
+        const float first = v[i], second = i + half < count ? v[i + half] : 0.0f;
+        v[i] = (is_upper ? second : first) + __shfl_xor_sync(kAllLanes, is_upper ? first : second, bit);
     }
-    if constexpr (half > 1) fold<half / 2>(v, lane);
-}
-
-// Sums over the warp of up to 32 values at once: lane l gets that of value l. 31 shuffles, where one after the other
-// would take 5 for each.
-inline float warp_sums(const float* values, int lane) {
-    float v[32];
-#pragma unroll
-    for (int i = 0; i < 32; i++) v[i] = i < WIDTH ? values[i < WIDTH ? i : 0] : 0.0f;
-    fold<16>(v, lane);
-    return v[0];
+    int rest = 0;
+    if constexpr (bit > 1) rest = fold<half, bit / 2>(v, lane);
+    return is_upper ? half + rest : rest < half ? rest : count;
 }
 
 }  // namespace
@@ -70,6 +64,8 @@ backward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entri
     SHARED(Staged, staged, kBatch);
     SHARED(LocalSignal, signals, kBatch);
     SHARED(int, slots, kBatch);  // -1: it only hides others
+    SHARED(float2, anchors, kBatch);  // the tile's centre, less the anchor
+    SHARED(unsigned, blenders, kBatch);  // a bit for each warp that it was blended in
     SHARED(float, parts, kWarps * kBatch * WIDTH);
     const Pixel pixel(view);
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
@@ -103,6 +99,11 @@ backward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entri
             const float sx = from_anchor_x(view, pixel.tile, r), sy = from_anchor_y(view, pixel.tile, r);
             if (CHOSEN) signals[threadIdx.x] = LocalSignal::of({view.camera.width, view.camera.height}, r, sx, sy);
             slots[threadIdx.x] = index[entry.record] < rows ? entry.slot : -1;
+            anchors[threadIdx.x] = make_float2(sx, sy);
+            unsigned warps = 0;
+            for (int w = 0; w < kWarps; w++)
+                warps |= (blended[words + batch * kWarps + w] >> threadIdx.x & 1) << w;
+            blenders[threadIdx.x] = warps;
         }
         __syncthreads();
         for (unsigned todo = blended[words + batch * kWarps + warp]; todo;) {
@@ -115,8 +116,8 @@ backward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entri
             Adder adder;
             ray.step<Splat>(s.local, s, signal, pixel.dx, pixel.dy, (int)(at - begin) + j, is_fixed, adder);
             if (is_fixed) continue;
-            const float sum = warp_sums(adder.s, lane);
-            if (lane < WIDTH) parts[(warp * kBatch + j) * WIDTH + lane] = sum;
+            const int column = fold<WIDTH>(adder.s, lane);
+            if (column < WIDTH) parts[(warp * kBatch + j) * WIDTH + column] = adder.s[0];
         }
         __syncthreads();
         for (int k = threadIdx.x; k < kBatch * WIDTH; k += kThreads) {
@@ -125,16 +126,13 @@ backward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entri
             float sum = 0, shifted = 0;
             // Those of a surfel's columns 0 to 5 are about the tile's centre: the anchor is (sx, sy) away.
             const bool is_moment = kKind == kSurfel && column < 6;
-            for (int w = 0; w < kWarps; w++) {
-                if (!(blended[words + batch * kWarps + w] >> j & 1)) continue;
+            for (unsigned todo = blenders[j]; todo; todo &= todo - 1) {
+                const int w = __ffs(todo) - 1;
                 sum += parts[(w * kBatch + j) * WIDTH + column];
                 if (is_moment) shifted += parts[(w * kBatch + j) * WIDTH + 6 + column % 3];
             }
-            if (is_moment) {
-                const Entry entry = entries[at + j];
-                const SplatRecord r = records[entry.record];
-                sum += (column < 3 ? from_anchor_x(view, pixel.tile, r) : from_anchor_y(view, pixel.tile, r)) * shifted;
-            }
+            const float2 anchor = anchors[j];
+            if (is_moment) sum += (column < 3 ? anchor.x : anchor.y) * shifted;
             sums[(long long)slots[j] * WIDTH + column] = sum;
             if (column == 0) touched[slots[j]] = 1;
         }

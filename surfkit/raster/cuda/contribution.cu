@@ -12,6 +12,7 @@ KERNEL(kThreads)
 contribution(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries, Buffer<const long long> offsets,
              float alpha_power, float open_power, Buffer<float> sums, Buffer<int> counts) {
     SHARED(Staged, staged, kBatch);
+    SHARED(Reach, reaches, kBatch);
     SHARED(int, slots, kBatch);
     SHARED(float, sum_parts, kWarps* kBatch);
     SHARED(int, count_parts, kWarps* kBatch);
@@ -26,13 +27,15 @@ contribution(View view, Buffer<const SplatRecord> records, Buffer<const Entry> e
         const int count = (int)min((long long)kBatch, end - at);
         if (threadIdx.x < count) {
             const Entry entry = entries[at + threadIdx.x];
-            staged[threadIdx.x] = stage(view, pixel.tile, records[entry.record]);
+            const SplatRecord r = records[entry.record];
+            staged[threadIdx.x] = stage(view, pixel.tile, r);
+            reaches[threadIdx.x] = reach(view, pixel.tile, r);
             slots[threadIdx.x] = entry.slot;
         }
         __syncthreads();
         bool is_near = false;
         if (lane < count) {
-            const Staged s = staged[lane];
+            const Reach s = reaches[lane];
             is_near = touches(s, pixel);
         }
         const unsigned near = __ballot_sync(kAllLanes, is_near);
@@ -80,13 +83,13 @@ contribution(View view, Buffer<const SplatRecord> records, Buffer<const Entry> e
 
 // Sums and numbers of each splat of `index`, over the slots from first[r] on.
 KERNEL(128)
-total(Buffer<const long long> index, Buffer<const long long> first, Buffer<const float> sums, Buffer<const int> counts,
+total(Buffer<const long long> index, Buffer<const int> first, Buffer<const float> sums, Buffer<const int> counts,
       Buffer<float> total_sum, Buffer<long long> total_count) {
     const long long r = blockIdx.x * 128LL + threadIdx.x;
     if (r >= index.size) return;
-    double sum = 0;
+    Pair sum = 0;
     long long count = 0;
-    for (long long slot = first[r]; slot < first[r + 1]; slot++) {
+    for (int slot = first[r]; slot < first[r + 1]; slot++) {
         sum += sums[slot];
         count += counts[slot];
     }
@@ -94,17 +97,16 @@ total(Buffer<const long long> index, Buffer<const long long> first, Buffer<const
     total_count[index[r]] = count;
 }
 
-// 1 - product of 1 - alpha of the splats met on the way to points (x px, y px, z); points of `order` lie in the image.
+// 1 - product of 1 - alpha of the splats met on the way to points (x, y, z), in pixels about the centre of their tile;
+// points of `order` lie in the image.
 KERNEL(128)
 probe(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries, Buffer<const long long> offsets,
-      Buffer<const double> points, Buffer<const long long> order, Buffer<float> opacity) {
+      Buffer<const float> points, Buffer<const int> tiles, Buffer<const long long> order, Buffer<float> opacity) {
     const long long k = blockIdx.x * 128LL + threadIdx.x;
     if (k >= order.size) return;
     const long long i = order[k];
-    const double x = points[3 * i], y = points[3 * i + 1];
-    const int tile_x = (int)x / kTile, tile_y = (int)y / kTile, tile = tile_y * view.tiles_x + tile_x;
-    const float dx = (float)(x - (tile_x * kTile + kTile / 2)), dy = (float)(y - (tile_y * kTile + kTile / 2)),
-                z = (float)points[3 * i + 2];
+    const int tile = tiles[i];
+    const float dx = points[3 * i], dy = points[3 * i + 1], z = points[3 * i + 2];
     float open = 1.0f;
     for (long long at = offsets[tile]; at < offsets[tile + 1]; at++) {
         const Entry entry = entries[at];

@@ -5,17 +5,20 @@ using namespace surfkit;
 
 namespace {
 constexpr int kBatch = 128;  // splats staged together
+// Blocks of a multiprocessor, at least: as many as the registers allow with hardly a spill.
+constexpr int kBlocks = kKind == kSurfel && LEVEL == kDistortion ? 3 : 4;
 }
 
 // The maps of LEVEL, and what the way back needs: what is left open of each pixel's ray, its last and its median splat,
 // and the moments of distortion. In `blended`, 32 splats of a tile's list share a word for each warp, with a bit for
 // each that was blended into one of the warp's pixels; those of a tile begin at 8 (offsets[tile] / 32 + tile).
-KERNEL(kThreads)
+KERNEL(kThreads, kBlocks)
 forward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries, Buffer<const long long> offsets,
         Buffer<float> color, Buffer<float> alpha, Buffer<float> depth, Buffer<float> median, Buffer<float> normal,
         Buffer<float> distortion, Buffer<float> open, Buffer<int> last, Buffer<int> middle, Buffer<float> shift,
         Buffer<float> m1, Buffer<float> m2, Buffer<unsigned> blended) {
     SHARED(Staged, staged, kBatch);
+    SHARED(Reach, reaches, kBatch);
     const Pixel pixel(view);
     const int warp = threadIdx.x / 32, lane = threadIdx.x % 32;
     const long long begin = offsets[pixel.tile], end = offsets[pixel.tile + 1];
@@ -27,14 +30,16 @@ forward(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entrie
         const int count = (int)min((long long)kBatch, end - at);
         if (threadIdx.x < count) {
             const Entry entry = entries[at + threadIdx.x];
-            staged[threadIdx.x] = stage(view, pixel.tile, records[entry.record]);
+            const SplatRecord r = records[entry.record];
+            staged[threadIdx.x] = stage(view, pixel.tile, r);
+            reaches[threadIdx.x] = reach(view, pixel.tile, r);
         }
         __syncthreads();
         for (int group = 0; group < count; group += 32) {
             const int mine = group + lane;
             bool is_near = false;
             if (mine < count) {
-                const Staged s = staged[mine];
+                const Reach s = reaches[mine];
                 is_near = touches(s, pixel);
             }
             unsigned hits = 0;

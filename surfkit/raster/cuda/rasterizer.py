@@ -20,7 +20,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
-from surfkit.raster.culling import boxes_may_touch, may_touch
+from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
 from surfkit.raster.validate import validate
@@ -30,6 +30,7 @@ KERNEL_FOLDER = Path(__file__).parent
 TILE_SIDE_PX, WARPS_PER_TILE = 16, 8
 SURFEL, GAUSSIAN, RAY = 0, 1, 2
 RECORD_BYTES = {SURFEL: 192, GAUSSIAN: 128, RAY: 192}
+TINT_BYTES, ENTRY_BYTES = 40, 8
 SUMS = {SURFEL: 20, GAUSSIAN: 16, RAY: 24}
 """Sums over the pixels that each splat gets on the way back; with chosen losses 4 more, of which 2 are used."""
 LEVEL_COLOR, LEVEL_GEOMETRY, LEVEL_DISTORTION = 0, 1, 2
@@ -40,30 +41,42 @@ NEVER = torch.iinfo(torch.int64).max
 
 
 class RasterView(ctypes.Structure):
-    """`RasterView` of view.h."""
+    """`View` of view.h, where a `Pair` is two floats."""
 
     _fields_ = (
-        ("pose", ctypes.c_double * 15),  # rotation by columns, translation, and the camera's position
-        ("lens", ctypes.c_double * 5),  # fx, fy, cx, cy, near
+        ("pose", ctypes.c_float * 30),  # rotation by columns, translation, and the camera's position
+        ("lens", ctypes.c_float * 10),  # fx, fy, cx, cy, near
         ("size", ctypes.c_int * 2),
-        ("dilation", ctypes.c_double),
+        ("rounded_camera", ctypes.c_float * 20),  # pose and lens again
+        ("rounded_size", ctypes.c_int * 2),
+        ("sides", ctypes.c_float * 12),
+        ("dilation", ctypes.c_float * 2),
         ("is_compensated", ctypes.c_bool),
         ("geometry", ctypes.c_int),
-        ("rim", ctypes.c_double),
+        ("rim", ctypes.c_float),
         ("tiles", ctypes.c_int * 2),
     )
+
+
+def _pairs(*numbers: float) -> list[float]:
+    """Each as the sum of two floats, one after the other."""
+    highs = [ctypes.c_float(number).value for number in numbers]
+    return [part for number, high in zip(numbers, highs, strict=True) for part in (high, number - high)]
 
 
 def _view(splats: Splats, camera: Camera, near: float, rim: float) -> RasterView:
     pose = camera.world_to_camera.double().cpu()
     turn, shift = pose[:3, :3], pose[:3, 3]
     numbers = [*turn.T.flatten().tolist(), *shift.tolist(), *(-turn.T @ shift).tolist()]
-    width, height = camera.width, camera.height
+    lens, width, height = (camera.fx, camera.fy, camera.cx, camera.cy, near), camera.width, camera.height
     return RasterView(
-        (ctypes.c_double * 15)(*numbers),
-        (ctypes.c_double * 5)(camera.fx, camera.fy, camera.cx, camera.cy, near),
+        (ctypes.c_float * 30)(*_pairs(*numbers)),
+        (ctypes.c_float * 10)(*_pairs(*lens)),
         (ctypes.c_int * 2)(width, height),
-        splats.dilation,
+        (ctypes.c_float * 20)(*numbers, *lens),
+        (ctypes.c_int * 2)(width, height),
+        (ctypes.c_float * 12)(*(number for side in image_sides(camera) for number in side)),
+        (ctypes.c_float * 2)(*_pairs(splats.dilation)),
         splats.antialias,
         GEOMETRIES.index(splats.geometry),
         rim,
@@ -83,7 +96,7 @@ class RasterPass:
         arrays: The five tensors of the splats.
         seen, radii: As in `Render`.
         index: (M,) int64, the splat of each record: those seen, by depth.
-        first: (M + 1,) int64, the first slot of each record; a slot is a pair of a splat and a tile.
+        first: (M + 1,) int32, the first slot of each record; a slot is a pair of a splat and a tile.
         entries: (slots, 2) int32, record and slot, by tile and depth; those of tile t are offsets[t] to offsets[t + 1].
     """
 
@@ -103,7 +116,9 @@ class RasterPass:
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
         self.coefficients = self.arrays[4].shape[1]
         self.tiles = self.view.tiles[0] * self.view.tiles[1]
-        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, COEFFICIENTS=self.coefficients)
+        self.tile_bytes = 2 if self.tiles < 2**15 else 4  # a sort takes a pass for each
+        defines = {"COEFFICIENTS": self.coefficients, "TILE_BYTES": self.tile_bytes}
+        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, **defines)
         touched, depth, slots = self._measure(project, splats)
         self._order(touched, depth)
         self._record(project, slots)
@@ -134,19 +149,24 @@ class RasterPass:
         """Give the splats that are seen a record each, by depth, and a slot for each tile; sets `index` and `first`."""
         index = self.seen.nonzero()[:, 0]
         self.index = index[depth[index].argsort(stable=True)]
-        self.first = torch.zeros(len(index) + 1, dtype=torch.int64, device=self.device)
-        torch.cumsum(touched[self.index], 0, out=self.first[1:])
+        self.first = torch.zeros(len(index) + 1, dtype=torch.int32, device=self.device)
+        torch.cumsum(touched[self.index], 0, dtype=torch.int32, out=self.first[1:])
 
     def _record(self, project: Kernels, slots: int) -> None:
-        """Write the records, and list them by tile; sets `records`, `entries` and `offsets`."""
+        """Write the records, and list them by tile; sets `records`, `tints`, `entries` and `offsets`."""
         shape, count = self.arrays[0].new_empty(0), len(self.index)
         self.records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
-        tile_of, record_of = shape.new_empty(2, slots, dtype=torch.int32).unbind()
+        number = torch.int16 if self.tile_bytes == 2 else torch.int32
+        tile_of, record_of = shape.new_empty(slots, dtype=number), shape.new_empty(slots, dtype=torch.int32)
+        keeps_tints = self.coefficients > 4  # `kKeepsTints` of view.h
+        self.tints = shape.new_empty(count * TINT_BYTES * keeps_tints, dtype=torch.uint8)
         given = *self.arrays, self.view, self.index, self.first
-        project.launch("record", blocks(count), 128, *given, self.records, tile_of, record_of)
+        project.launch("record", blocks(count), 128, *given, self.records, self.tints, tile_of, record_of)
         tile_of, slot = tile_of.sort(stable=True)
-        self.entries = torch.stack([record_of[slot], slot.int()], 1)
-        self.offsets = torch.searchsorted(tile_of, torch.arange(self.tiles + 1, device=self.device, dtype=torch.int32))
+        self.entries = shape.new_empty(slots, 2, dtype=torch.int32)
+        project.launch("list", blocks(slots), 128, slot, record_of, self.entries)
+        tiles = torch.arange(self.tiles + 1, device=self.device, dtype=tile_of.dtype)
+        self.offsets = torch.searchsorted(tile_of, tiles)
 
     @property
     def lists(self) -> tuple[object, ...]:
@@ -214,7 +234,8 @@ class CudaRender(Render):
         part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
         program = {"CHOSEN": int(chosen is not None), "WIDTH": width, "COEFFICIENTS": drawn.coefficients}
         gather = drawn.program("gather", LEVEL=LEVEL_COLOR, **program)
-        given = *arrays, drawn.view, drawn.index, drawn.first, sums, touched, rows
+        harmonics = arrays[4][:0] if len(drawn.tints) else arrays[4]
+        given = *arrays[:4], harmonics, drawn.view, drawn.tints, drawn.index, drawn.first, sums, touched, rows
         gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
         home = drawn.home
         standard: dict[str, Any] = {name: grad.to(home) for name, grad in zip(STANDARD, grads, strict=True)}
@@ -282,15 +303,18 @@ class TileRasterizer(Rasterizer):
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = self._pass(_grey(splats), camera, near, rim=0.0)
-        at = camera.project(points.to(drawn.device)).contiguous()
+        at = camera.project(points.to(drawn.device))
         x, y, z = at.unbind(1)
         inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         order = inside.nonzero()[:, 0]
-        tile = (y[order].long() // TILE_SIDE_PX) * drawn.view.tiles[0] + x[order].long() // TILE_SIDE_PX
-        order = order[tile.argsort(stable=True)]  # threads of a warp read the same list
+        column, row = (each.int() // TILE_SIDE_PX for each in (x, y))
+        tile = row * drawn.view.tiles[0] + column
+        order = order[tile[order].argsort(stable=True)]  # threads of a warp read the same list
+        middles = (torch.stack([column, row], 1) + 0.5) * TILE_SIDE_PX
+        local = torch.cat([at[:, :2] - middles, at[:, 2:]], 1).float()
         opacity = drawn.arrays[0].new_full((len(points),), torch.nan)
         program = drawn.program("contribution", LEVEL=LEVEL_GEOMETRY, CHOSEN=CHOSEN_NOTHING)
-        program.launch("probe", blocks(len(order)), 128, *drawn.lists, at, order, opacity)
+        program.launch("probe", blocks(len(order)), 128, *drawn.lists, local, tile, order, opacity)
         return opacity.to(points.device)
 
     def _pass(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> RasterPass:
@@ -314,12 +338,15 @@ def _grey(splats: Splats) -> Splats:
     return replace(splats, sh=splats.sh.new_zeros(len(splats), 1, 3))
 
 
+def _raw(name: str, size: int) -> type[ctypes.Structure]:
+    """A structure of which only the size is known."""
+    return type(name, (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * size),)})
+
+
 def source(name: str, **defines: int) -> CudaSource:
     """The source of NAME.cu for one kind of splats."""
-    record = type(
-        "SplatRecord", (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * RECORD_BYTES[defines["KIND"]]),)}
-    )
-    entry = type("Entry", (ctypes.Structure,), {"_fields_": (("record", ctypes.c_int), ("slot", ctypes.c_int))})
-    return CudaSource(
-        KERNEL_FOLDER / f"{name}.cu", defines, {"SplatRecord": record, "Entry": entry, "View": RasterView}
-    )
+    sizes = {"SplatRecord": RECORD_BYTES[defines["KIND"]], "SplatTint": TINT_BYTES, "Entry": ENTRY_BYTES}
+    sizes["TileNumber"] = defines.get("TILE_BYTES", 4)
+    structures: dict[str, type[ctypes.Structure]] = {"View": RasterView}
+    structures |= {name: _raw(name, size) for name, size in sizes.items()}
+    return CudaSource(KERNEL_FOLDER / f"{name}.cu", defines, structures, is_exact=name in ("project", "gather"))

@@ -1,16 +1,18 @@
 // What ../pixels.h and ../project.h ask for: a thread has one pixel or one splat.
 #pragma once
 
+#include "pair.h"
+
+typedef Pair Real;
 typedef float Floats;
 typedef int Ints;
 typedef bool Mask;
 #define SURFKIT_INLINE inline
 #define SPLAT_FN inline
 
-inline double square_root(double x) { return sqrt(x); }
 inline float square_root(float x) { return sqrtf(x); }
-inline double natural_log(double x) { return log(x); }
-inline double round_down(double x) { return floor(x); }
+inline float natural_log(float x) { return logf(x); }
+inline float round_down(float x) { return floorf(x); }
 
 inline float broadcast(float x) { return x; }
 inline float madd(float a, float b, float c) { return fmaf(a, b, c); }

@@ -26,11 +26,14 @@ constexpr int kWarps = kThreads / 32;
 constexpr int kStrip = 8, kRows = 4;  // pixels of a warp
 
 struct View {
-    CameraModel<double> camera;
-    splat::GaussianForm form;
-    double rim;
+    CameraModel<Pair> camera;
+    Outlook<float> outlook;
+    GaussianForm form;
+    float rim;
     int tiles_x, tiles_y;
 };
+
+inline Vec<float> rounded(Vec<Pair> v) { return {(float)v.x, (float)v.y, (float)v.z}; }
 
 #ifdef COEFFICIENTS
 // Activated values of splats, as in raster/api.py.
@@ -38,6 +41,13 @@ struct Arrays {
     Buffer<const float> means, quats, scales, opacities, sh;
     static constexpr int coefficients = COEFFICIENTS;
 };
+typedef splat::Sight<float> Sight;
+inline Sight sight(const View& view, const SplatIn<Pair>& in) {
+    return splat::sight(rounded(in.mean - view.camera.centre), COEFFICIENTS);
+}
+typedef Tint<float> SplatTint;
+// `record` keeps the tints for the way back where they are less to read than the harmonics.
+constexpr bool kKeepsTints = COEFFICIENTS > 4;
 #endif
 
 // A splat of a tile's list: which record draws it, and which row of sums its gradient goes to.
@@ -79,8 +89,11 @@ struct Staged {
     float normal[3];
 #endif
     float color[3];
+};
+// Where it may be drawn, in shared memory too.
+struct Reach {
     Bound<float> bound;  // about the tile's centre
-    splat::Outline<float> outline;
+    Outline<float> outline;
 };
 
 // The tile's centre, less the splat's anchor.
@@ -105,14 +118,22 @@ inline Staged stage(const View& view, int tile, const SplatRecord& r) {
         o.normal[c] = r.normal[c];
 #endif
     }
-    const float hyy = 1 / r.flat, hxy = r.tilt * hyy;
-    o.bound = {r.mx - sx, r.my - sy, r.wide + r.tilt * hxy, hxy, hyy, r.disc_x - sx, r.disc_y - sy, r.disc_r2};
-    o.outline = splat::outline(o.bound);
     return o;
 }
 
+// (sx, sy): what it is to be about, less the splat's anchor. Not by `outline`: of a long and thin ellipse it would lose
+// the width, which the record has.
+inline Reach reach(const SplatRecord& r, float sx, float sy) {
+    const float hyy = 1 / r.flat, hxy = r.tilt * hyy, hxx = r.wide + r.tilt * hxy, hx = square_root(hxx);
+    return {{r.mx - sx, r.my - sy, hxx, hxy, hyy, r.disc_x - sx, r.disc_y - sy, r.disc_r2},
+            {hx, square_root(hyy), r.tilt, r.wide, hxy / hx}};
+}
+inline Reach reach(const View& view, int tile, const SplatRecord& r) {
+    return reach(r, from_anchor_x(view, tile, r), from_anchor_y(view, tile, r));
+}
+
 // Whether a splat may touch one of the warp's pixels.
-inline bool touches(const Staged& s, const Pixel& p) {
+inline bool touches(const Reach& s, const Pixel& p) {
     float low, high;
     const float slack = 2e-3f;  // the bound is in float here
     return splat::bound_span(s.bound, s.outline, p.top - slack, p.top + kRows - 1 + slack, low, high) &&

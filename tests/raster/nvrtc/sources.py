@@ -46,7 +46,7 @@ SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
     (passes.SOURCE_BY_SAMPLES[16], {"improve": (128, 0, 1000)}),
     (passes.SOURCE_BY_SAMPLES[32], {"improve": (168, 0, 1000)}),
     (codes.CODES_SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
-    (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
+    (raster("project"), {"measure": (128, 0), "record": (168, 0), "list": (32, 0)}),
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),
     (raster("gather"), {"gather": (168, 0)}),

@@ -1,7 +1,11 @@
 // CUDA's names for the emulator: qualifiers, vectors, arithmetic, and what warps and blocks do together.
 #pragma once
 
+#include <cfloat>
+
 #include "memory.h"
+
+static_assert(FLT_EVAL_METHOD == 0, "a float is rounded to a float at each step, as on a GPU");
 
 #define __global__
 #define __device__
@@ -66,6 +70,7 @@ inline float __frsqrt_rn(float x) { return 1.0f / sqrtf(x); }
 inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 inline float __fmul_rn(float a, float b) { return a * b; }
 inline float __fadd_rn(float a, float b) { return a + b; }
+inline float __fsub_rn(float a, float b) { return a - b; }
 inline float __saturatef(float x) { return x > 0 ? (x < 1 ? x : 1.0f) : 0.0f; }
 
 namespace emulator {
