@@ -240,7 +240,7 @@ def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
     step = dict(launches)
     on.contribution(splats, camera, 0.2, 0.5, 0.5)
     lists = render._pass
-    facts = {"seen": len(lists.index) / share, "pairs": len(lists.entries) / share}
+    facts = {"seen": len(lists.index) / share, "pairs": lists.slots / share}
     return step | {name: launches[name] for name in ("contribution", "total")}, facts
 
 

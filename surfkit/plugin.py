@@ -83,6 +83,7 @@ from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.init import SH_C0, facing, seeds
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
+from surfkit.primitives.storage import Storage
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
@@ -232,6 +233,7 @@ __all__ = [
     "StepCount",
     "StepDone",
     "Steps",
+    "Storage",
     "Stored",
     "Surfel2D",
     "TSDF",

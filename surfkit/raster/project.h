@@ -48,12 +48,13 @@ SPLAT_FN bool valid(const SplatIn<Real>& s, int columns) {
     return none == 0 && positive;
 }
 
-// Colour of a splat, below 0 too.
+// Colour of a splat, below 0 too. The first term is exact: a black point has a colour of 0 but for what its number was
+// rounded by, and it depends on the sign of that whether it can learn.
 template <class Arrays, class R>
 SPLAT_FN void shade(const Arrays& s, long long i, const splat::Sight<R>& sight, R rgb[3]) {
-    for (int c = 0; c < 3; c++) rgb[c] = R(0.5);
     const long long row = 3LL * s.coefficients * i;
-    for (int k = 0; k < s.coefficients; k++)
+    for (int c = 0; c < 3; c++) rgb[c] = R(Real(0.5) + s.sh[row + c] * Real(0.28209479177387814));
+    for (int k = 1; k < s.coefficients; k++)
         for (int c = 0; c < 3; c++) rgb[c] += sight.basis[k] * s.sh[row + 3 * k + c];
 }
 

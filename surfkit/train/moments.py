@@ -18,7 +18,7 @@ MASK = 0xFFFFFFFF
 
 
 def is_short(moment: Tensor) -> bool:
-    """Whether a moment is kept in 16 bits."""
+    """Whether a moment, (N, ...), is kept in 16 bits."""
     return moment.dtype == SHORT
 
 

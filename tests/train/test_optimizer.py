@@ -1,21 +1,32 @@
 """What optimizers are told of a step."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import pytest
 import torch
 
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.api import Maps
 from surfkit.raster.reference import Reference
+from surfkit.train.adam import Adam
 from surfkit.train.stage import Stage
 from surfkit.train.step import view_gradients
 
 
+@dataclass(frozen=True)
+class Pulling(Adam):
+    """One that wants other gradients too."""
+
+    pulls: ClassVar[bool] = True
+
+
 def test_what_is_pulled_is_the_product_with_the_jacobian(begin):
     """Of the trainer's own step, by differences: a change of the parameters changes the maps."""
-    trainer, state = begin(Stage(densify=None), Gaussian3D(1))
+    trainer, state = begin(Stage(densify=None, optimizer=Pulling()), Gaussian3D(1))
     result = view_gradients(trainer, state)
     draw = torch.Generator().manual_seed(5)
-    cotangent = torch.randn(result.render.maps.color.shape, generator=draw)
+    cotangent = torch.randn(result.maps.color.shape, generator=draw)
     pulled, camera = result.pull(Maps(color=cotangent)), result.target.view.camera
     assert result.pull(Maps(color=cotangent))["means"].equal(pulled["means"]), "it can be asked again"
     double = {name: value.double() for name, value in state.points.params.items()}

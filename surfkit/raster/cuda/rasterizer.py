@@ -97,7 +97,10 @@ class RasterPass:
         seen, radii: As in `Render`.
         index: (M,) int64, the splat of each record: those seen, by depth.
         first: (M + 1,) int32, the first slot of each record; a slot is a pair of a splat and a tile.
-        entries: (slots, 2) int32, record and slot, by tile and depth; those of tile t are offsets[t] to offsets[t + 1].
+        slots: How many there are.
+        lists: What kernels that go through the tiles' lists take first: the view, records, and (slots, 2) int32
+            entries, record and slot, by tile and depth; those of tile t are offsets[t] to offsets[t + 1]. They are made
+            again where they have been let go of.
     """
 
     def __init__(
@@ -118,12 +121,15 @@ class RasterPass:
         self.tiles = self.view.tiles[0] * self.view.tiles[1]
         self.tile_bytes = 2 if self.tiles < 2**15 else 4  # a sort takes a pass for each
         defines = {"COEFFICIENTS": self.coefficients, "TILE_BYTES": self.tile_bytes}
-        project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, **defines)
-        touched, depth, slots = self._measure(project, splats)
+        self._project = self.program("project", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING, **defines)
+        touched, depth, self.slots = self._measure(splats)
         self._order(touched, depth)
-        self._record(project, slots)
 
-    def _measure(self, project: Kernels, splats: Splats) -> tuple[Tensor, Tensor, int]:
+    def let_go(self) -> None:
+        """Free the memory of the lists."""
+        self.__dict__.pop("lists", None)
+
+    def _measure(self, splats: Splats) -> tuple[Tensor, Tensor, int]:
         """(N,) int32 tiles that each splat touches, (N,) depths, and the sum of the former; sets `seen` and `radii`.
 
         Raises:
@@ -132,7 +138,8 @@ class RasterPass:
         count, shape = len(splats), self.arrays[0].new_empty(0)
         touched, self.radii = shape.new_empty(count, dtype=torch.int32), shape.new_empty(count)
         depth, invalid = shape.new_empty(count), shape.new_full((1,), NEVER, dtype=torch.int64)
-        project.launch("measure", blocks(count), 128, *self.arrays[:4], self.view, touched, depth, self.radii, invalid)
+        launch = self._project.launch
+        launch("measure", blocks(count), 128, *self.arrays[:4], self.view, touched, depth, self.radii, invalid)
         self.seen = touched > 0
         slots, wrong = torch.stack([touched.sum(), invalid[0]]).tolist()  # waits for the device
         if wrong != NEVER:
@@ -152,30 +159,26 @@ class RasterPass:
         self.first = torch.zeros(len(index) + 1, dtype=torch.int32, device=self.device)
         torch.cumsum(touched[self.index], 0, dtype=torch.int32, out=self.first[1:])
 
-    def _record(self, project: Kernels, slots: int) -> None:
-        """Write the records, and list them by tile; sets `records`, `tints`, `entries` and `offsets`."""
-        shape, count = self.arrays[0].new_empty(0), len(self.index)
-        self.records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
+    @cached_property
+    def lists(self) -> tuple[RasterView, Tensor, Tensor, Tensor]:
+        """Write the records, and list them by tile, (slots, 2) of them; sets `tints`, too."""
+        shape, count, slots, project = self.arrays[0].new_empty(0), len(self.index), self.slots, self._project
+        records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
         number = torch.int16 if self.tile_bytes == 2 else torch.int32
         tile_of, record_of = shape.new_empty(slots, dtype=number), shape.new_empty(slots, dtype=torch.int32)
         keeps_tints = self.coefficients > 4  # `kKeepsTints` of view.h
         self.tints = shape.new_empty(count * TINT_BYTES * keeps_tints, dtype=torch.uint8)
         given = *self.arrays, self.view, self.index, self.first
-        project.launch("record", blocks(count), 128, *given, self.records, self.tints, tile_of, record_of)
+        project.launch("record", blocks(count), 128, *given, records, self.tints, tile_of, record_of)
         tile_of, slot = tile_of.sort(stable=True)
-        self.entries = shape.new_empty(slots, 2, dtype=torch.int32)
-        project.launch("list", blocks(slots), 128, slot, record_of, self.entries)
+        entries = shape.new_empty(slots, 2, dtype=torch.int32)
+        project.launch("list", blocks(slots), 128, slot, record_of, entries)
         tiles = torch.arange(self.tiles + 1, device=self.device, dtype=tile_of.dtype)
-        self.offsets = torch.searchsorted(tile_of, tiles)
-
-    @property
-    def lists(self) -> tuple[object, ...]:
-        """What kernels that go through the tiles' lists take first."""
-        return self.view, self.records, self.entries, self.offsets
+        return self.view, records, entries, torch.searchsorted(tile_of, tiles)
 
     def words(self) -> int:
         """Words of 32 bits that `forward` notes in which splats are blended where."""
-        return (len(self.entries) // 32 + self.tiles + 1) * WARPS_PER_TILE
+        return (self.slots // 32 + self.tiles + 1) * WARPS_PER_TILE
 
 
 class CudaRender(Render):
@@ -224,11 +227,12 @@ class CudaRender(Render):
         cotangents = [*self._cotangents(total), *self._cotangents(chosen or Maps())]
         level, what = self._levels(total, chosen, absolute)
         width = SUMS[drawn.kind] + 4 * (chosen is not None)
-        slots = len(drawn.entries)
-        sums, touched = arrays[0].new_empty(slots, width), arrays[0].new_zeros(slots, dtype=torch.uint8)
+        sums, touched = arrays[0].new_empty(drawn.slots, width), arrays[0].new_zeros(drawn.slots, dtype=torch.uint8)
         backward = drawn.program("backward", LEVEL=level, CHOSEN=what, WIDTH=width)
-        given = *drawn.lists, drawn.index, rows, *cotangents, *self._saved
+        given: tuple[Any, ...] = *drawn.lists, drawn.index, rows, *cotangents, *self._saved
         backward.launch("backward", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, touched)
+        del given
+        drawn.let_go()  # the gradients take about as much
         grads = [torch.zeros_like(each[:rows]) for each in arrays]
         signal = arrays[0].new_zeros(rows, 2)
         part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
@@ -284,7 +288,7 @@ class TileRasterizer(Rasterizer):
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
         drawn = self._pass(_grey(splats), camera, near)
-        one, slots = drawn.arrays[0], len(drawn.entries)
+        one, slots = drawn.arrays[0], drawn.slots
         sums, counts = one.new_zeros(slots), one.new_zeros(slots, dtype=torch.int32)
         total, count = one.new_zeros(len(splats)), one.new_zeros(len(splats), dtype=torch.int64)
         program = drawn.program("contribution", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING)
