@@ -45,7 +45,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
 
     # Losses: the maps are compared with the photograph, and with a second view where a loss wants one.
     second = neighbour(setup, state, splats, at, render.maps) if stage.is_paired(index) else None
-    appearance = ImageAppearance.of_step(stage, state, at)
+    appearance = ImageAppearance.of_step(stage, state, at, camera)
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
 
@@ -72,7 +72,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     if in_view is not None:
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
-        result.appearance.learn()
+        result.appearance.learn(result.render.maps.need("color"), result.target)
     adam_step(state.points, grads, rates_at(setup, state), index, None if in_view is None else in_view.rows)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())

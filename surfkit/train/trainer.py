@@ -51,7 +51,7 @@ class Trainer(StageSetup):
             )
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
-            state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
+            state.appearances = fresh_appearances(self.stage.appearance, self.views)
         state.move(self.rasterizer.where())
         return state
 

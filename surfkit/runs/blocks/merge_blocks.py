@@ -73,7 +73,7 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     state.peak_gpu_bytes = max(part.peak_gpu_bytes for part in parts)
     state.sh_degree = max(part.sh_degree for part in parts)
     if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
-        state.appearances = fresh_appearances(recipe.tune.appearance, len(ctx.scene.train))
+        state.appearances = fresh_appearances(recipe.tune.appearance, ctx.scene.train)
     return state
 
 
