@@ -6,7 +6,6 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
@@ -16,48 +15,28 @@ from surfkit.scene.camera import Camera
 
 
 @dataclass(frozen=True)
-class Looks:
-    """What an appearance model knows of photographs.
+class PhotoLight:
+    """How cameras changed the light of V photographs, from the colours of sparse points; `appearance.response` says
+    what the numbers mean.
 
     Attributes:
-        photos: (V, ...) numbers of each photograph.
-        cameras: (C, ...) numbers of each camera that took some of them.
-        taken_by: (V,) int64, the row of `cameras` of each photograph; on the CPU.
+        stops: (V, 3) float32 of red, green and blue, with a mean of 0 over the photographs of the scene.
+        cameras: (V, 8) float32 vignetting and response curve of the camera that took each.
     """
 
-    photos: Tensor
+    stops: Tensor
     cameras: Tensor
-    taken_by: Tensor
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A photograph beside its render.
-
-    Attributes:
-        at: Its row in `Looks`.
-        camera: The pinhole camera of both; positions on the sensor are counted from its principal point.
-        color: (3, H, W) render, in the colours of the scene; constant.
-        photo: (3, H, W) photograph in [0, 1].
-        mask: (H, W) bool, False where the photograph is to be ignored; None where all of it counts.
-    """
-
-    at: int
-    camera: Camera
-    color: Tensor
-    photo: Tensor
-    mask: Tensor | None = None
 
 
 class Appearance(Component):
-    """Turns the colours of the scene into those of one photograph, with a few numbers learned per photograph and, if the
-    model has such, per camera.
+    """Turns the colours of the scene into those of one photograph, with a few numbers per photograph.
 
-    One that `is_centred` keeps the scene in the colours of the mean photograph all along: what one stage has learned
-    then holds in the next, and blocks of a scene learn alike.
+    The numbers are learned, or known before training begins: those of a model that `needs_light` begin with what is
+    found from the sparse points (`begin_with`), alike in all stages and blocks of a scene. The data set must then tell
+    which photographs show which points.
     """
 
-    is_centred: ClassVar[bool] = False
+    needs_light: ClassVar[bool] = False
 
     def refuse_unfit(self, primitive: Primitive) -> None:  # noqa: B027 (some fit all)
         """BadInput if the colours of this primitive cannot be changed by it; asked before anything is trained."""
@@ -66,29 +45,23 @@ class Appearance(Component):
     def begin(self, count: int) -> Tensor:
         """(V, ...) numbers of `count` photographs, with which nothing changes."""
 
-    def begin_cameras(self, count: int) -> Tensor:
-        """(C, ...) numbers of `count` cameras, with which nothing changes; none by default. Only `fitted` learns them."""
-        return torch.zeros(count, 0)
+    def begin_with(self, light: PhotoLight) -> Tensor:
+        """(V, ...) numbers of photographs whose light is known; of models that `needs_light`."""
+        raise NotImplementedError
 
     @abstractmethod
     def rate_at(self, index: int, steps: int) -> float:
-        """The learning rate in step `index` of 1..`steps`."""
+        """The learning rate in step `index` of 1..`steps`; 0 throughout where the numbers stay as they begin."""
 
     @abstractmethod
-    def __call__(self, numbers: Tensor, color: Tensor, of_camera: Tensor, camera: Camera) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         """(3, H, W) colours as the photograph shows them.
 
         Args:
-            numbers: Of the photograph. The result is differentiable in them, unless `fitted` finds them.
-            color: (3, H, W) of the scene; the result is differentiable in them.
-            of_camera: Numbers of the camera that took it.
-            camera: That camera: which pixel lies where.
+            numbers: Its own. The result is differentiable in them, where they are learned.
+            color: (3, H, W) of the scene. The result is differentiable in them.
+            camera: That took it: which pixel lies where on the sensor.
         """
-
-    def fitted(self, looks: Looks, shown: Shown, rate: float) -> Looks | None:
-        """The numbers after a look at a photograph, by a rule of the model's own; None, the default, if the numbers of
-        photographs are learned by Adam from the gradients of the losses."""
-        return None
 
     @abstractmethod
     def folded(self, numbers: Tensor, params: Columns) -> Columns:

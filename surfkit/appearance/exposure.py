@@ -48,7 +48,7 @@ class Exposure(Appearance):
     def rate_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, numbers: Tensor, color: Tensor, of_camera: Tensor, camera: Camera) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         return torch.einsum("ij,jhw->ihw", numbers[:, :3], color) + numbers[:, 3, None, None]
 
     def folded(self, numbers: Tensor, params: Columns) -> Columns:

@@ -24,7 +24,16 @@ from surfkit.train.stage import Stage
 
 SHARED = "shared.json"
 """What a run shares with others, see `surfkit.runs.run_cache`."""
-RUN_FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
+RUN_FILES = (
+    "recipe.json",
+    "run.json",
+    "inputs.json",
+    "events.jsonl",
+    "light.json",
+    "metrics.json",
+    "point_cloud.ply",
+    SHARED,
+)
 """In a run folder."""
 RUN_FOLDERS = (
     "pretrain",
@@ -252,6 +261,11 @@ class Run:
     def inputs(self) -> Path:
         """The fingerprint of the data."""
         return self.out / "inputs.json"
+
+    @property
+    def light(self) -> Path:
+        """How cameras changed the light of the photographs, where an appearance needs it."""
+        return self.out / "light.json"
 
 
 def refuse_file(out: Path) -> None:

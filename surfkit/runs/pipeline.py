@@ -41,6 +41,7 @@ from surfkit.runs.make_levels import has_levels, make_wanted_levels
 from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate, measure_compressed
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.photo_light import LightRecord, needed_light, write_light
 from surfkit.runs.recipe import Recipe, complete, refuse_unused
 from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
 from surfkit.runs.run_cache import RunCache
@@ -153,9 +154,12 @@ class RecipeStages:
     def __init__(self, ctx: RunContext, compute: Compute, meter: MemoryMeter, state: StageState | None) -> None:
         self.ctx, self.compute, self.meter, self.state = ctx, compute, meter, state
         self.start: InitialPointBuilder | None = None
+        self.light: LightRecord | None = None
 
     def begin(self) -> None:
-        """Find where the first stage begins, or BadInput; nothing is written."""
+        """Find where the first stage begins, and the light of the photographs, or BadInput; nothing is written."""
+        if self.ctx.run.recipe.has_stages:
+            self.light = needed_light(self.ctx.run, self.ctx.scene)
         if self.ctx.run.recipe.has_stages and not self.is_shared:
             self.start = initial_points(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
 
@@ -168,6 +172,7 @@ class RecipeStages:
         """Optimise what is not finished yet."""
         ctx, run, state, start = self.ctx, self.ctx.run, self.state, self.start
         self.start = self.state = None
+        write_light(run, self.light)
         if start is not None:
             discard_results(run, run.pretrain)
             job = StageJob(run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start)
@@ -189,6 +194,7 @@ class RecipeStages:
         with prefix_notes("partition: "), record_events(run.out):
             state = load_state(run, run.pretrain, ctx.scene, repair=True)
             if (start := initial_points(run, ctx.scene, ctx.caches, state)) is not None:
+                write_light(run, needed_light(run, ctx.scene))
                 job = StageJob(
                     run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start
                 )

@@ -22,6 +22,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, select
 from surfkit.runs.folder import Run, RunStage
+from surfkit.runs.photo_light import light_of
 from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
@@ -169,7 +170,9 @@ def begin(job: StageJob, trainer: Trainer) -> StageState:
     began = time.perf_counter(), time.process_time()
     start, primitive = job.start(generator), job.stage.primitive
     points = replace(Points.fresh(start.params, primitive.shared()), stats=dict(start.stats))
-    state = trainer.begin(points, generator, job.frozen().params if job.frozen else None)
+    model = job.stage.stage.appearance
+    light = light_of(job.run, job.scene.train) if model is not None and model.needs_light else None
+    state = trainer.begin(points, generator, job.frozen().params if job.frozen else None, light)
     state.sh_degree = min(start.sh_degree, primitive.sh_degree)
     state.seconds, state.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     if job.before is not None:

@@ -72,7 +72,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     if in_view is not None:
         require_finite_gradients(index, view, grads)
     if result.appearance is not None:
-        result.appearance.learn(result.render.maps.need("color"), result.target)
+        result.appearance.learn()
     adam_step(state.points, grads, rates_at(setup, state), index, None if in_view is None else in_view.rows)
     if in_view is None:
         require_finite_values(index, view, state.points.all_params())

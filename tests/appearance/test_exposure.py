@@ -11,17 +11,19 @@ from surfkit.raster.psnr import psnr
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View
 
+CAMERA = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 8.0, 8.0, 16, 16)
+
 
 def test_it_begins_by_changing_nothing():
     color = torch.rand(3, 4, 5)
-    assert torch.equal(Exposure()(Exposure().begin(3)[1], color), color)
+    assert torch.equal(Exposure()(Exposure().begin(3)[1], color, CAMERA), color)
 
 
 def test_it_is_the_matrix_and_the_offset():
     numbers = torch.arange(12.0).view(3, 4) / 10
     color = torch.rand(3, 2, 2)
     expected = numbers[:, :3] @ color[:, 1, 0] + numbers[:, 3]
-    assert torch.allclose(Exposure()(numbers, color)[:, 1, 0], expected)
+    assert torch.allclose(Exposure()(numbers, color, CAMERA)[:, 1, 0], expected)
 
 
 def test_folded_points_have_the_colours_of_the_mean_photograph():
@@ -38,7 +40,7 @@ def test_folded_points_have_the_colours_of_the_mean_photograph():
     before, after = (
         colors(primitive.activate(p, 2), camera) for p in (params, Exposure().folded(numbers, params))
     )  # fmt: skip
-    expected = Exposure()(numbers.mean(0), before.T[:, :, None])[:, :, 0].T
+    expected = Exposure()(numbers.mean(0), before.T[:, :, None], CAMERA)[:, :, 0].T
     assert before.min() > 0 and torch.allclose(after, expected, atol=1e-5)
 
 

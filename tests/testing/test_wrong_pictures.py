@@ -173,8 +173,8 @@ class Darkens(Exposure):
 
 
 class Unlearned(Exposure):
-    def __call__(self, numbers, color):
-        return Exposure.__call__(self, numbers.detach(), color)
+    def __call__(self, numbers, color, camera):
+        return Exposure.__call__(self, numbers.detach(), color, camera)
 
 
 class Reverses(Exposure):

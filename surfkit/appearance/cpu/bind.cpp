@@ -34,18 +34,17 @@ const RespondKernels& named(const std::string& name) {
 }  // namespace
 
 void add_appearance(nb::module_& m) {
-    // own: 3 stops; camera: falloff (3), centre (2), curves (9, by channel).
-    m.def("respond", [](Image color, Line x, Line y, std::vector<double> own, std::vector<double> camera, ImageOut out,
-                        ImageOut slope, const std::string& kernels, int threads) {
+    // numbers: stops (3), falloff (3), centre (2), curve (3).
+    m.def("respond", [](Image color, Line x, Line y, std::vector<double> numbers, ImageOut out, ImageOut slope,
+                        const std::string& kernels, int threads) {
         RespondJob job{};
         job.color = color.data(), job.x = x.data(), job.y = y.data(), job.out = out.data(), job.slope = slope.data();
         job.height = (int)color.shape(1), job.width = (int)color.shape(2);
-        for (int i = 0; i < 3; i++) job.own[i] = (float)own.at(i), job.falloff[i] = (float)camera.at(i);
-        for (int i = 0; i < 2; i++) job.centre[i] = (float)camera.at(3 + i);
-        for (int i = 0; i < 9; i++) {
-            job.curve[i / 3][i % 3] = (float)camera.at(5 + i);
-            job.curved |= camera[5 + i] != 0;
+        for (int i = 0; i < 3; i++) {
+            job.stops[i] = (float)numbers.at(i), job.falloff[i] = (float)numbers.at(3 + i);
+            job.curve[i] = (float)numbers.at(8 + i);
         }
+        for (int i = 0; i < 2; i++) job.centre[i] = (float)numbers.at(6 + i);
         const RespondKernels& k = named(kernels);
         nb::gil_scoped_release free;
         parallel((job.height + kRows - 1) / kRows, threads, [&](int64_t i) {

@@ -47,8 +47,10 @@ SURFKIT_INLINE Floats brightened(Floats color, Floats gain, Floats root, Floats&
 
 void respond(const RespondJob& j, int y0, int y1) {
     const size_t plane = (size_t)j.width * j.height;
+    const float* k = j.curve;
+    const bool curved = k[0] != 0 || k[1] != 0 || k[2] != 0;
     float gain[3], root[3];
-    for (int c = 0; c < 3; c++) gain[c] = std::exp2(j.own[c]), root[c] = std::exp2(j.own[c] / kPower);
+    for (int c = 0; c < 3; c++) gain[c] = std::exp2(j.stops[c]), root[c] = std::exp2(j.stops[c] / kPower);
     for (int row = y0; row < y1; row++) {
         const float dy = j.y[row] - j.centre[1];
         for (int column = 0; column < j.width; column += kLanes) {
@@ -63,8 +65,7 @@ void respond(const RespondJob& j, int y0, int y1) {
                 Floats v = brightened(load_some(j.color + c * plane + at, n), shade * gain[c], shade_root * root[c], slope);
                 const Mask over = lesser(1.0f, v);
                 v = lower(v, broadcast(1.0f));
-                if (j.curved) {
-                    const float *k = j.curve[c];
+                if (curved) {
                     const Floats u = 1.0f - 2.0f * higher(v, Floats{}), uu = u * u, bow = 0.25f * (1.0f - uu);
                     v = madd(bow, k[0] + u * k[1] + (0.25f * k[2]) * (5.0f * uu - 1.0f), v);
                     slope *= 1.0f + k[0] * u + (0.5f * k[1]) * (3.0f * uu - 1.0f) + (0.5f * k[2]) * u * (5.0f * uu - 3.0f);

@@ -8,11 +8,10 @@ namespace surfkit {
 struct RespondJob {
     const float* color;        // (3, height, width)
     const float *x, *y;        // (width), (height): places on the sensor
-    float own[3];              // stops of each channel
+    float stops[3];            // of each channel
     float falloff[3];          // stops at r^2, r^4, r^6
     float centre[2];           // where r is 0
-    float curve[3][3];         // terms of each channel
-    bool curved;               // whether any of them is not 0
+    float curve[3];            // its terms
     int width, height;
     float *out, *slope;        // (3, height, width) colours, and their derivatives; negative where they were above 1
 };

@@ -41,7 +41,7 @@ class NewPart(Appearance):
         """From `start` to `end`, along a straight line in the logarithm."""
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, numbers: Tensor, color: Tensor, of_camera: Tensor, camera: Camera) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         """(3, H, W) the colours times their factors."""
         return color * numbers.exp()[:, None, None]
 
