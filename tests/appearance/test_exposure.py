@@ -3,13 +3,10 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
-from surfkit.evaluate.images.measure_images import color_corrected, evaluate_views
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Maps
 from surfkit.raster.projection import colors
-from surfkit.raster.psnr import psnr
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import SparsePoints, View
+from surfkit.scene.scene import SparsePoints
 
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 8.0, 8.0, 16, 16)
 
@@ -49,16 +46,3 @@ def test_the_rate_falls_evenly_in_the_logarithm():
     assert Exposure().rate_at(500, 1_000) == pytest.approx((1e-2 * 1e-3) ** 0.5)
     with pytest.raises(BadInput, match="0.0"):
         Exposure(end=0.0)
-
-
-def test_correction_finds_the_change_of_colour():
-    draw = torch.Generator().manual_seed(1)
-    photo = torch.rand(3, 20, 30, generator=draw)
-    change = torch.eye(3) + 0.2 * torch.rand(3, 3, generator=draw)
-    render = torch.einsum("ij,jhw->ihw", change, photo) - 0.1
-    assert psnr(color_corrected(render, photo), photo) > 90 > psnr(render, photo)
-    assert torch.isfinite(color_corrected(torch.zeros(3, 4, 4), torch.rand(3, 4, 4))).all()
-    view = View("a.png", Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 15.0, 10.0, 30, 20), None)
-    found = evaluate_views([view], [(photo * 255).byte()], lambda _: Maps(color=0.5 * photo), correct_color=True)
-    assert found["images"]["psnr_corrected"] > 40 > found["images"]["psnr"]
-    assert found["images"]["per_image"]["a.png"].keys() == {"psnr", "ssim", "psnr_corrected"}
