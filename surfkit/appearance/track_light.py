@@ -48,6 +48,8 @@ ENOUGH = 1e-5
 """The fit ends where a round lowers its cost by a smaller share."""
 ROBUST = 2.0
 """Differences of so many standard deviations count half (Cauchy)."""
+UNEVEN_STOPS, UNEVEN_BALANCE, DARK_CORNER, UNEVEN_CURVE = 0.5, 0.1, 0.8, 0.03
+"""Light is uneven from these on, see `LightSpread`."""
 MIN_SEEN = 10
 """Points that a photograph must share with others to be compared with them."""
 MEANS = 3
@@ -66,7 +68,7 @@ class TrackColors:
 
     Attributes:
         photo: (K,) int64, the photograph.
-        point: (K,) int64, the point, counted from 0 without gaps.
+        point: (K,) int64, the number of the point.
         place: (K, 2) float64 x and y on the sensor, from the principal point, in halves of the picture's diagonal.
         color: (K, 3) float64 sRGB in [0, 1].
     """
@@ -136,42 +138,70 @@ def rows_of(views: Sequence[View]) -> np.ndarray:
     return np.array([names[view.taken_by] for view in views], np.int64)
 
 
-def light_words(light: TrackLight, taken_by: np.ndarray) -> str:
-    """How far photographs differ, how dark corners are and how many cameras there are, in a line."""
-    spread = light_spread(light)
-    corners = ", ".join(f"{corner:.0%}" for corner in spread.corners)
-    cameras = f"{len(light.cameras)} cameras" if len(light.cameras) > 1 else "1 camera"
-    return (
-        f"exposures within {spread.stops:.1f} stops and white balance within {spread.balance:.0%} (80 % of the "
-        f"photographs); corners have {corners} of the light of the middle ({cameras})"
-    )
-
-
 @dataclass(frozen=True)
 class LightSpread:
     """How far photographs differ.
 
     Attributes:
-        stops: Between the exposures of the 10th and the 90th percentile of the photographs.
-        balance: The same of the ratio of red or blue to green, whichever is more, as a share.
-        corners: Light that each camera leaves half a diagonal away from the middle, as a share of that in the middle.
+        stops: From the 10th to the 90th percentile of the exposures.
+        balance: The same of red, or of blue, as shares of green; the larger one.
+        corner: Light that is left half a diagonal away from the middle, as a share of that in the middle; of the camera
+            with the darkest corners.
+        curve: Largest difference, in colours in [0, 1], between the response curve of a camera and the mean one.
+        cameras: How many cameras there are.
     """
 
     stops: float
     balance: float
-    corners: tuple[float, ...]
+    corner: float
+    curve: float = 0.0
+    cameras: int = 1
 
+    @classmethod
+    def of(cls, light: TrackLight) -> LightSpread:
+        """That of a fit; photographs that share too few points do not count."""
+        known = light.stops[light.seen >= MIN_SEEN]
+        if not len(known):
+            return cls(0.0, 0.0, 1.0)
+        values = np.column_stack([known.mean(1), known[:, 0] - known[:, 1], known[:, 2] - known[:, 1]])
+        low, high = np.percentile(values, [10, 90], axis=0)
+        stops, *balance = (high - low).tolist()
+        corner = min(float(2 ** -falloff(numbers, 1.0)) for numbers in light.cameras)
+        fine = np.linspace(0, 1, 101)
+        curve = max(float(np.abs(curved(fine, numbers[CURVE]) - fine).max()) for numbers in light.cameras)
+        return cls(stops, 2 ** max(balance) - 1, corner, curve, len(light.cameras))
 
-def light_spread(light: TrackLight) -> LightSpread:
-    """How far the photographs of a fit differ; those that share too few points do not count."""
-    known = light.stops[light.seen >= MIN_SEEN]
-    if not len(known):
-        known = np.zeros((1, 3))
-    exposure, balance = known.mean(1), known[:, [0, 2]] - known[:, 1:2]
-    low, high = np.percentile(np.column_stack([exposure, balance]), [10, 90], axis=0)
-    stops, *ratios = (high - low).tolist()
-    corners = 2.0 ** -np.array([falloff(camera, 1.0) for camera in light.cameras])
-    return LightSpread(stops, 2 ** max(ratios) - 1, tuple(corners.tolist()))
+    @property
+    def is_uneven(self) -> bool:
+        """Whether one colour for each place cannot explain the photographs."""
+        uneven = self.stops >= UNEVEN_STOPS or self.balance >= UNEVEN_BALANCE
+        return uneven or self.corner <= DARK_CORNER or self.curve >= UNEVEN_CURVE
+
+    def remedy(self, has_tracks: bool, settings: Sequence[str]) -> str:
+        """What is said of light that is uneven, with what to do.
+
+        Args:
+            has_tracks: Whether the data set tells which photographs show which points.
+            settings: Dotted paths of the appearances to add.
+        """
+        if has_tracks:
+            cure = (
+                f"add {' '.join(f'{one}:camera-response' for one in settings)}, which finds all of it before training"
+            )
+        else:
+            learned = " ".join(f"{one}:exposure" for one in settings)
+            cure = (
+                f"add {learned}, which learns an exposure for each, or give `surfkit prepare points` and choose "
+                "camera-response"
+            )
+        return f"the same places look different: {self}; {cure}"
+
+    def __str__(self) -> str:
+        several = f", response curves of {self.cameras} cameras by {self.curve:.0%} of the range"
+        return (
+            f"exposures differ by {self.stops:.1f} stops and white balance by {self.balance:.0%} (10th to 90th "
+            f"percentile){several * (self.cameras > 1)}; corners have {self.corner:.0%} of the light of the middle"
+        )
 
 
 def fit_light(colors: TrackColors, taken_by: np.ndarray) -> TrackLight:

@@ -10,7 +10,7 @@ import torch
 
 from surfkit.appearance.base import PhotoLight
 from surfkit.appearance.response import CENTRE, CURVE, FALLOFF
-from surfkit.appearance.track_light import MIN_SEEN, TrackLight, fit_light, light_words, rows_of, track_colors
+from surfkit.appearance.track_light import MIN_SEEN, LightSpread, TrackLight, fit_light, rows_of, track_colors
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
@@ -19,6 +19,9 @@ from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
 from surfkit.runs.folder import Run
 from surfkit.scene.scene import Scene, View
+
+GROUPS, GROUP = 5, 20
+"""Of photographs, and how many each has, that are looked at for a warning."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +86,8 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
             f"data set has none; {points_remedy(run.data.path, (view.name for view in scene.train))}, or choose "
             "appearance:exposure, which learns from the photographs alone"
         )
-    taken_by = rows_of(scene.train)
-    light = fit_light(track_colors(scene.train, tracks), taken_by)
-    say(f"light of the photographs: {light_words(light, taken_by)}")
+    light = fit_light(track_colors(scene.train, tracks), rows_of(scene.train))
+    say(f"light of the photographs: {LightSpread.of(light)}")
     if unknown := [view.name for view, seen in zip(scene.train, light.seen, strict=True) if seen < MIN_SEEN]:
         emit(
             Warned(
@@ -94,6 +96,23 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
             )
         )
     return recorded(light, scene.train)
+
+
+def warn_of_light(run: Run, scene: Scene) -> None:
+    """Say how far light differs between photographs, where it is uneven and a stage takes all colours as they are.
+
+    Of many photographs, some are looked at: groups that follow one another in the order of their names.
+    """
+    settings = run.recipe.without_appearance
+    if not settings or (tracks := observations(run.data, scene)).is_empty:
+        return
+    views = scene.train
+    if len(views) > GROUPS * GROUP:
+        starts = np.linspace(0, len(views) - GROUP, GROUPS).astype(int)
+        views = tuple(view for start in starts for view in views[start : start + GROUP])
+    spread = LightSpread.of(fit_light(track_colors(views, tracks), rows_of(views)))
+    if spread.is_uneven:
+        emit(Warned(spread.remedy(True, settings)))
 
 
 def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:

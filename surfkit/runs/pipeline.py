@@ -41,7 +41,7 @@ from surfkit.runs.make_levels import has_levels, make_wanted_levels
 from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate, measure_compressed
 from surfkit.runs.methods.base import Reconstruction
-from surfkit.runs.photo_light import LightRecord, needed_light, write_light
+from surfkit.runs.photo_light import LightRecord, needed_light, warn_of_light, write_light
 from surfkit.runs.recipe import Recipe, complete, refuse_unused
 from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
 from surfkit.runs.run_cache import RunCache
@@ -121,6 +121,8 @@ def run(
         refuse_unplannable(run, scene)
         warn_of_gaps(scene, state)
         warn_of_no_edits(run, scene)
+        if state is None:
+            warn_of_light(run, scene)
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))

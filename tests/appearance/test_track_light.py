@@ -8,10 +8,9 @@ from PIL import Image
 from surfkit.appearance.response import curved
 from surfkit.appearance.track_light import (
     MIN_SEEN,
+    LightSpread,
     TrackColors,
     fit_light,
-    light_spread,
-    light_words,
     rows_of,
     track_colors,
 )
@@ -74,6 +73,9 @@ def test_curves_of_two_cameras_are_told_apart():
         assert np.abs(curved(at, curve) - curved(at, truth)).max() < 0.02
     assert np.abs(light.cameras[:, 5:].mean(0)).max() < 1e-3
     assert light.deviation < 0.005
+    spread = LightSpread.of(light)
+    assert spread.curve == pytest.approx(np.abs(curved(at, one) - at).max(), abs=0.02)
+    assert "response curves of 2 cameras by" in str(spread)
 
 
 def test_photographs_that_share_too_little_are_known_by_their_count():
@@ -89,11 +91,26 @@ def test_photographs_that_share_too_little_are_known_by_their_count():
     others = np.setdiff1d(np.arange(PHOTOS), [4, 9])
     off = (light.stops - stops)[others]
     assert np.abs(off - off.mean(0)).max() < 0.02
-    spread = light_spread(light)
+    spread = LightSpread.of(light)
     low, high = np.percentile(stops[others].mean(1), [10, 90])
-    assert spread.stops == pytest.approx(high - low, abs=0.05) and spread.corners[0] == pytest.approx(CORNER, abs=0.01)
-    words = light_words(light, taken_by)
-    assert f"within {spread.stops:.1f} stops" in words and "50%" in words and "(1 camera)" in words
+    assert spread.stops == pytest.approx(high - low, abs=0.05) and spread.corner == pytest.approx(CORNER, abs=0.01)
+    low, high = np.percentile(stops[others][:, [0, 2]] - stops[others][:, 1:2], [10, 90], axis=0)
+    assert spread.balance == pytest.approx(2 ** (high - low).max() - 1, abs=0.02) and spread.is_uneven
+    assert f"differ by {spread.stops:.1f} stops" in str(spread) and "have 50% of the light" in str(spread)
+
+
+@pytest.mark.parametrize(
+    ("figures", "uneven"),
+    [
+        ((0.49, 0.09, 0.81, 0.029), False),
+        ((0.5, 0.0, 1.0, 0.0), True),
+        ((0.0, 0.1, 1.0, 0.0), True),
+        ((0.0, 0.0, 0.8, 0.0), True),
+        ((0.0, 0.0, 1.0, 0.03), True),
+    ],
+)
+def test_light_is_uneven_from_stated_limits_on(figures, uneven):
+    assert LightSpread(*figures).is_uneven == uneven
 
 
 def test_nothing_seen_changes_nothing():

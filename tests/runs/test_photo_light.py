@@ -7,13 +7,15 @@ from PIL import Image
 from two_blocks import EVERY, STEPS, stop_after
 
 from surfkit.appearance import CameraResponse
+from surfkit.appearance.track_light import TrackColors
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.partition import PictureShare, QuantileGrid
-from surfkit.runs import pipeline
+from surfkit.runs import photo_light, pipeline
 from surfkit.runs.blocks.train_blocks import Compute
+from surfkit.runs.folder import Run
 from surfkit.runs.photo_light import LightRecord, light_of
 from surfkit.runs.pipeline import load_run, opened, run
 from surfkit.runs.recipe import Recipe
@@ -21,6 +23,8 @@ from surfkit.scene.srgb import from_linear, linear
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
+
+NOTHING = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +100,27 @@ def test_numbers_that_are_gone_are_named(data, recipe, tmp_path):
     stranger = replace(scene.train[0], name="stranger.png")
     with pytest.raises(BadInput, match="light.json: it lacks 'stranger.png'; delete it"):
         light_of(opened(tmp_path), [scene.train[1], stranger])
+
+
+def test_uneven_light_is_told_where_no_stage_learns_it(data, recipe, tmp_path, capsys):
+    short = replace(recipe.pretrain, steps=1, appearance=None)
+    run(replace(recipe, pretrain=short), data, tmp_path / "plain", Compute("cpu"), EVERY)
+    told = capsys.readouterr().err
+    assert "exposures differ by 1.0 stops" in told and "add pretrain.appearance:camera-response" in told
+    run(replace(recipe, pretrain=short), data, tmp_path / "plain", Compute("cpu"), EVERY)
+    assert "exposures differ" not in capsys.readouterr().err, "of a finished run"
+    run(replace(recipe, pretrain=replace(short, appearance=CameraResponse())), data, tmp_path / "with", Compute("cpu"))
+    told = capsys.readouterr().err
+    assert "add pretrain.appearance" not in told and "light of the photographs: exposures differ by 1.0 stops" in told
+
+
+def test_of_many_photographs_some_are_looked_at(data, recipe, monkeypatch):
+    looked = []
+    monkeypatch.setattr(photo_light, "track_colors", lambda views, tracks: looked.append(views) or NOTHING)
+    monkeypatch.setattr(photo_light, "GROUPS", 2)
+    monkeypatch.setattr(photo_light, "GROUP", 3)
+    plain = replace(recipe, pretrain=replace(recipe.pretrain, appearance=None))
+    scene = read(data)
+    photo_light.warn_of_light(Run(data.path / "run", plain, data), scene)
+    names = [view.name for view in scene.train]
+    assert [view.name for view in looked[0]] == [*names[:3], *names[-3:]]
