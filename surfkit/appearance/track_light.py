@@ -44,7 +44,7 @@ ROUNDS = 20
 """Of the robust fit; each solves a linear problem."""
 SHARES = (1.0, 0.5, 0.25, 0.125)
 """Of a step that are tried: where the problem is far from linear, a whole one may lead away."""
-ENOUGH = 1e-5
+LEAST_PROGRESS = 1e-5
 """The fit ends where a round lowers its cost by a smaller share."""
 ROBUST = 2.0
 """Differences of so many standard deviations count half (Cauchy)."""
@@ -234,7 +234,7 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray) -> TrackLight:
             if (reached := problem.cost(problem.residuals(tried, deviation), tried, deviation)) < cost:
                 numbers = tried
                 break
-        if reached > (1 - ENOUGH) * cost:
+        if reached > (1 - LEAST_PROGRESS) * cost:
             break
     return TrackLight(numbers.stops, numbers.cameras, seen, deviation)
 
