@@ -1,7 +1,7 @@
 """Photographs as cameras take them: what changing light does to a run, and what models of appearance make of it.
 
     python bench/light.py            # writes bench/results/light.json
-    python bench/light.py --only exposure all
+    python bench/light.py --only same all --recipe surface-short --scale 2 --steps 300 --gt TRUTH --name light_surface
 
 Variants of a rendered survey (shibuya-synth), with seeds that never change; beside each is its truth, as light.json:
 
@@ -13,9 +13,10 @@ Variants of a rendered survey (shibuya-synth), with seeds that never change; bes
 
 Light is changed as in a camera: sRGB is decoded, multiplied, limited to 1, encoded, and put through the response curve.
 Each variant is trained without and with each appearance, one run after the other, on every photograph that is not held
-out. Printed, and kept: PSNR on held-out photographs as it is and after the colour correction of `surfkit evaluate`; the
-same against the photographs of the unchanged survey, as the scene itself is the same; and how far exposures, vignetting
-and response curves are from the truth, but for what no one can know: a factor that all photographs share, and a curve.
+out. Printed, and kept: PSNR and SSIM on held-out photographs, as they are and with colours aligned; PSNR against those
+of the unchanged survey, as the scene itself is the same; and how far exposures, vignetting and response curves are from
+the truth, but for what no one can know: a factor that all photographs share, and a curve. With --gt the mesh is measured
+too. --cost measures only what a step takes: medians of CPU seconds of all threads, for 200,000 splats.
 """
 
 from __future__ import annotations
@@ -29,15 +30,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import save
+import torch
+from machine import cpu_seconds, save
 from PIL import Image
+from scenes import city
 
 import surfkit
+from surfkit.appearance import CameraResponse
 from surfkit.appearance.response import curved, falloff
 from surfkit.core.codec import read_json
 from surfkit.evaluate.images.measure_images import aligned_halves
 from surfkit.io.datasets.raw_dataset import load_pycolmap
+from surfkit.raster.api import Maps
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.psnr import psnr
+from surfkit.raster.ssim import ssim
 from surfkit.runs.photo_light import LightRecord
 from surfkit.scene.photos import read_photo
 from surfkit.scene.srgb import from_linear, linear
@@ -106,9 +113,13 @@ def train(data: Path, out: Path, appearance: str, options: argparse.Namespace) -
     """A run of the recipe, whose messages go to a file beside it."""
     words = [f"recipe:{options.recipe}", "--data", str(data), "--out", str(out), "--scale", str(options.scale)]
     words += ["--steps", str(options.steps), "--test-every", "8", "--device", "cpu"]
-    words += [*options.set, f"pretrain.appearance:{appearance}", "mesh:none"]
+    words += [f"pretrain.appearance:{appearance}", *["mesh:none"] * (options.gt is None)]
+    commands = [["train", *words]]
+    if options.gt is not None:
+        commands.append(["evaluate", str(out), "--gt", str(options.gt), "--tau", "0.5", "--draws", "1"])
     with open(out.with_suffix(".txt"), "w") as log:
-        subprocess.run([sys.executable, "-m", "surfkit", "train", *words], check=True, stdout=log, stderr=log)
+        for command in commands:
+            subprocess.run([sys.executable, "-m", "surfkit", *command], check=True, stdout=log, stderr=log)
 
 
 def recovered(out: Path, truth: dict[str, Any]) -> dict[str, float]:
@@ -169,6 +180,30 @@ def against(out: Path, plain: Path) -> float:
     return float(np.mean(found))
 
 
+def costs(rounds: int) -> dict[str, dict[str, float]]:
+    """CPU seconds of a step (render, L1 and SSIM, backward) by size, and of `camera-response` in it."""
+    numbers = torch.tensor([0.3, 0.2, 0.1, 0.5, 0.2, 0.1, 0.01, 0.0, 0.2, -0.1, 0.05])
+    found = {}
+    for width, height in ((1600, 1200), (800, 608), (400, 304)):
+        splats, camera = city(width=width, height=height)
+        photo = torch.rand(3, height, width)
+        color = torch.rand(3, height, width).requires_grad_()
+
+        def step(splats=splats, camera=camera, photo=photo) -> None:
+            render = NativeRasterizer().render(splats, camera, 0.2)
+            shown = render.maps.need("color").clone().requires_grad_()
+            loss = 0.8 * (shown - photo).abs().mean() + 0.2 * (1 - ssim(shown, photo))
+            render.backward(Maps(color=torch.autograd.grad(loss, shown)[0]))
+
+        def respond(color=color, camera=camera, photo=photo) -> None:
+            torch.autograd.grad(CameraResponse()(numbers, color, camera), color, photo)
+
+        row = {"step": cpu_seconds(step, rounds), "camera-response": cpu_seconds(respond, rounds)}
+        found[f"{width} x {height}"] = {name: round(value, 5) for name, value in row.items()}
+        print(f"{width} x {height}: " + ", ".join(f"{name} {value * 1e3:.1f} CPU-ms" for name, value in row.items()))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=PACK)
@@ -177,10 +212,14 @@ def main() -> None:
     parser.add_argument("--recipe", default="2dgs")
     parser.add_argument("--scale", type=float, default=4.0)
     parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--set", nargs="*", default=[], help="further words of surfkit train")
+    parser.add_argument("--gt", type=Path, help="truth of the mesh, which is made and measured with it; none else")
     parser.add_argument("--work", type=Path, help="folder for data sets and runs; a temporary one if left out")
     parser.add_argument("--name", default="light", help="of the file in bench/results")
+    parser.add_argument("--cost", action="store_true", help="only what a step takes")
     options = parser.parse_args()
+    if options.cost:
+        print(f"wrote {save('light_cost', costs(11))}")
+        return
     with tempfile.TemporaryDirectory() as temporary:
         work, found = options.work or Path(temporary), {}
         for variant in options.only:
@@ -192,8 +231,11 @@ def main() -> None:
                 out = work / f"{variant}-{appearance}"
                 train(data, out, appearance, options)
                 row = {"against the unchanged": against(out, options.data)}
-                images = read_json(out / "metrics.json", dict[str, Any])["images"]
+                metrics = read_json(out / "metrics.json", dict[str, Any])
+                images = metrics["images"]
                 row |= {name: images[name] for name in ("psnr", "psnr_aligned", "ssim", "ssim_aligned")}
+                if options.gt is not None:
+                    row |= {name: metrics["geometry"][name] for name in ("precision", "recall", "f1")}
                 if appearance == "camera-response":
                     row |= recovered(out, truth)
                 found[f"{variant}, {appearance}"] = row

@@ -133,7 +133,7 @@ def check_appearance(appearance: Appearance) -> None:
         appearance: To check.
     """
     name, draw = type(appearance).__name__, torch.Generator().manual_seed(0)
-    rates = [appearance.rate_at(index, 1_000) for index in (1, 500, 1_000)]
+    rates = [appearance.rate_at(*at) for at in ((1, 1_000), (500, 1_000), (1_000, 1_000), (30_000, 30_000))]
     _check_rates(name, rates)
     assert any(rates) or appearance.needs_light, f"{name}: the learning rate is 0 throughout, so nothing is learned"
     numbers, color = appearance.begin(5), torch.rand(3, 12, 16, generator=draw)
