@@ -15,8 +15,8 @@ Light is changed as in a camera: sRGB is decoded, multiplied, limited to 1, enco
 Each variant is trained without and with each appearance, one run after the other, on every photograph that is not held
 out. Printed, and kept: PSNR and SSIM on held-out photographs, as they are and with colours aligned; PSNR against those
 of the unchanged survey, as the scene itself is the same; and how far exposures, vignetting and response curves are from
-the truth, but for what no one can know: a factor that all photographs share, and a curve. With --gt the mesh is measured
-too. --cost measures only what a step takes: medians of CPU seconds of all threads, for 200,000 splats.
+the truth, but for what no one can know: a factor that all photographs share, and a curve. With --gt the mesh is
+measured too. --cost measures only what a step takes: medians of CPU seconds of all threads, for 200,000 splats.
 """
 
 from __future__ import annotations
