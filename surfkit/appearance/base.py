@@ -3,16 +3,40 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class PhotoLight:
+    """How cameras changed the light of V photographs, from the colours of sparse points; `appearance.response` says
+    what the numbers mean.
+
+    Attributes:
+        stops: (V, 3) float32 of red, green and blue, with a mean of 0 over the photographs of the scene.
+        cameras: (V, 8) float32 vignetting and response curve of the camera that took each.
+    """
+
+    stops: Tensor
+    cameras: Tensor
 
 
 class Appearance(Component):
-    """Turns the colours of the scene into those of one photograph, with a few numbers learned per photograph."""
+    """Turns the colours of the scene into those of one photograph, with a few numbers per photograph.
+
+    The numbers are learned, or known before training begins: those of a model that `needs_light` begin with what is
+    found from the sparse points (`begin_with`), alike in all stages and blocks of a scene. The data set must then tell
+    which photographs show which points.
+    """
+
+    needs_light: ClassVar[bool] = False
 
     def refuse_unfit(self, primitive: Primitive) -> None:  # noqa: B027 (some fit all)
         """BadInput if the colours of this primitive cannot be changed by it; asked before anything is trained."""
@@ -21,13 +45,23 @@ class Appearance(Component):
     def begin(self, count: int) -> Tensor:
         """(V, ...) numbers of `count` photographs, with which nothing changes."""
 
-    @abstractmethod
-    def rate_at(self, index: int, steps: int) -> float:
-        """The learning rate in step `index` of 1..`steps`."""
+    def begin_with(self, light: PhotoLight) -> Tensor:
+        """(V, ...) numbers of photographs whose light is known; of models that `needs_light`."""
+        raise NotImplementedError
 
     @abstractmethod
-    def __call__(self, numbers: Tensor, color: Tensor) -> Tensor:
-        """(3, H, W) colours as the photograph shows them, from its own numbers; differentiable in both."""
+    def rate_at(self, index: int, steps: int) -> float:
+        """The learning rate in step `index` of 1..`steps`; 0 throughout where the numbers stay as they begin."""
+
+    @abstractmethod
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
+        """(3, H, W) colours as the photograph shows them.
+
+        Args:
+            numbers: Its own. The result is differentiable in them, where they are learned.
+            color: (3, H, W) of the scene. The result is differentiable in them.
+            camera: That took it: which pixel lies where on the sensor.
+        """
 
     @abstractmethod
     def folded(self, numbers: Tensor, params: Columns) -> Columns:

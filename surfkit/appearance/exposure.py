@@ -13,6 +13,7 @@ from surfkit.core.registry import name_of
 from surfkit.core.schedule import log_linear
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
+from surfkit.scene.camera import Camera
 
 SH0 = 0.28209479177387814
 """The spherical harmonic of degree 0: a colour is 0.5 + SH0 x its first coefficient + the rest."""
@@ -47,7 +48,7 @@ class Exposure(Appearance):
     def rate_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, numbers: Tensor, color: Tensor) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         return torch.einsum("ij,jhw->ihw", numbers[:, :3], color) + numbers[:, 3, None, None]
 
     def folded(self, numbers: Tensor, params: Columns) -> Columns:

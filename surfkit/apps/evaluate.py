@@ -43,14 +43,14 @@ from surfkit.train.progress_bars import bars
 class EvaluateCommand:
     """Measure a finished run on its held-out photographs, or with --gt its mesh against ground truth.
 
-    Without --gt: computes PSNR, SSIM and LPIPS, and writes metrics.json and the pictures again. With --gt: computes
-    precision, recall, F1, chamfer distances and angles between normals of RUN/mesh.ply, or of any mesh or point cloud
-    that is given instead of a run, for the whole surface and for each class of places. They are written to
-    metrics.json; the crop volume, the points coloured by error and the pictures are written to the folder geometry/
-    beside it. With and without --gt, a mesh is also measured by itself: edges with one triangle, loose parts, edges
-    with more than two triangles, triangles that cross others, triangles per area, and roughness on planes. --seen and
-    --seams also measure parts of the photographs; --seams also measures parts of the geometry. --lod also measures
-    levels of detail.
+    Without --gt: computes PSNR, SSIM and LPIPS, as they are and with colours aligned, and writes metrics.json and the
+    pictures again. With --gt: computes precision, recall, F1, chamfer distances and angles between normals of
+    RUN/mesh.ply, or of any mesh or point cloud that is given instead of a run, for the whole surface and for each class
+    of places. They are written to metrics.json; the crop volume, the points coloured by error and the pictures are
+    written to the folder geometry/ beside it. With and without --gt, a mesh is also measured by itself: edges with one
+    triangle, loose parts, edges with more than two triangles, triangles that cross others, triangles per area, and
+    roughness on planes. --seen and --seams also measure parts of the photographs; --seams also measures parts of the
+    geometry. --lod also measures levels of detail.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]

@@ -21,6 +21,14 @@ LPIPS = {
 }
 """Names in metrics.json, and on the screen."""
 
+ALIGNED = {
+    "psnr_aligned": ("PSNR", 2),
+    "ssim_aligned": ("SSIM", 3),
+    "lpips_vgg_aligned": ("LPIPS VGG", 3),
+    "lpips_alex_aligned": ("LPIPS AlexNet", 3),
+}
+"""The same of aligned colours, with digits."""
+
 LENGTH_UNITS = {"m": "metre", "unit": "unit"}
 """Of lengths of a mesh in metrics.json."""
 
@@ -130,6 +138,11 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
         rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
+    if images.get("psnr_aligned") is not None:
+        aligned = ", ".join(
+            f"{label} {images[name]:.{digits}f}" for name, (label, digits) in ALIGNED.items() if name in images
+        )
+        rows.append(("colours aligned", f"{aligned} (right halves, aligned on left ones)"))
     if lacking := images.get("not_measured"):
         rows.append(("photographs", f"not measured: {lacking}"))
     if lacking := images.get("lpips_not_measured"):

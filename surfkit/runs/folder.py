@@ -24,7 +24,16 @@ from surfkit.train.stage import Stage
 
 SHARED = "shared.json"
 """What a run shares with others, see `surfkit.runs.run_cache`."""
-RUN_FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
+RUN_FILES = (
+    "recipe.json",
+    "run.json",
+    "inputs.json",
+    "events.jsonl",
+    "light.json",
+    "metrics.json",
+    "point_cloud.ply",
+    SHARED,
+)
 """In a run folder."""
 RUN_FOLDERS = (
     "pretrain",
@@ -90,11 +99,6 @@ class RunStage:
         """What was measured of the model before, if the stage refines it."""
         return self.folder / "before.json"
 
-    @property
-    def learns_from_photographs(self) -> bool:
-        """Whether it is shown photographs, and not what another model draws."""
-        return self.refine is None or not self.refine.taught
-
 
 @dataclass(frozen=True)
 class Run:
@@ -156,17 +160,6 @@ class Run:
     def last(self) -> RunStage:
         """The stage whose result is that of the run."""
         return self.stages[-1]
-
-    @property
-    def color_stage(self) -> RunStage:
-        """The last stage that is shown photographs: colours are as it has learnt them."""
-        return self.color_stage_until(self.last)
-
-    def color_stage_until(self, last: RunStage) -> RunStage:
-        """The same, of the stages up to `last`."""
-        names = [stage.name for stage in self.stages]
-        before = self.stages[: names.index(last.name) + 1]
-        return [stage for stage in before if stage.learns_from_photographs][-1]
 
     @property
     def blocks(self) -> Path:
@@ -259,6 +252,11 @@ class Run:
     def inputs(self) -> Path:
         """The fingerprint of the data."""
         return self.out / "inputs.json"
+
+    @property
+    def light(self) -> Path:
+        """How cameras changed the light of the photographs, where an appearance needs it."""
+        return self.out / "light.json"
 
 
 def refuse_file(out: Path) -> None:

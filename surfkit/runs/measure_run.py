@@ -45,7 +45,7 @@ def evaluate(
         meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
         lpips_weights: See `surfkit.evaluate.images.lpips.networks`.
     """
-    sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
+    sides = [min(view.camera.width // 2, view.camera.height) for view in scene.held_out]  # halves are measured too
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides and made.draw else ((), None)
     colors = made.draw_color or made.draw
     ahead = PHOTOS_AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
@@ -63,7 +63,6 @@ def evaluate(
                 made.draw_there or made.draw,
                 timed=colors,
                 show=show,
-                correct_color=made.correct_color,
                 masks=mask_cache(scene.held_out, ahead),
                 networks=perceptual,
             )
@@ -109,7 +108,6 @@ def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
         scene.held_out,
         photo_cache(scene.held_out, ahead),
         drawing_colors(made),
-        correct_color=made.correct_color,
         masks=mask_cache(scene.held_out, ahead),
     )["images"]
     write_json(

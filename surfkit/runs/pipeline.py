@@ -41,6 +41,7 @@ from surfkit.runs.make_levels import has_levels, make_wanted_levels
 from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate, measure_compressed
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.photo_light import LightRecord, needed_light, warn_of_light, write_light
 from surfkit.runs.recipe import Recipe, complete, refuse_unused
 from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
 from surfkit.runs.run_cache import RunCache
@@ -120,6 +121,8 @@ def run(
         refuse_unplannable(run, scene)
         warn_of_gaps(scene, state)
         warn_of_no_edits(run, scene)
+        if state is None:
+            warn_of_light(run, scene)
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
@@ -153,9 +156,12 @@ class RecipeStages:
     def __init__(self, ctx: RunContext, compute: Compute, meter: MemoryMeter, state: StageState | None) -> None:
         self.ctx, self.compute, self.meter, self.state = ctx, compute, meter, state
         self.start: InitialPointBuilder | None = None
+        self.light: LightRecord | None = None
 
     def begin(self) -> None:
-        """Find where the first stage begins, or BadInput; nothing is written."""
+        """Find where the first stage begins, and the light of the photographs, or BadInput; nothing is written."""
+        if self.ctx.run.recipe.has_stages:
+            self.light = needed_light(self.ctx.run, self.ctx.scene)
         if self.ctx.run.recipe.has_stages and not self.is_shared:
             self.start = initial_points(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
 
@@ -168,6 +174,7 @@ class RecipeStages:
         """Optimise what is not finished yet."""
         ctx, run, state, start = self.ctx, self.ctx.run, self.state, self.start
         self.start = self.state = None
+        write_light(run, self.light)
         if start is not None:
             discard_results(run, run.pretrain)
             given, points_on = start.given, ctx.caches.points
@@ -192,6 +199,7 @@ class RecipeStages:
         with prefix_notes("partition: "), record_events(run.out):
             state = load_state(run, run.pretrain, ctx.scene, repair=True)
             if (start := initial_points(run, ctx.scene, ctx.caches, state)) is not None:
+                write_light(run, needed_light(run, ctx.scene))
                 given, points_on = start.given, ctx.caches.points
                 job = StageJob(
                     run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on

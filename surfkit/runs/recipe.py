@@ -173,6 +173,13 @@ class Recipe:
         return "pretrain" in self.method.uses
 
     @property
+    def without_appearance(self) -> list[str]:
+        """Dotted paths of the appearances of stages that take the colours of all photographs as they are."""
+        stages = {"pretrain": self.pretrain} if self.has_stages else {}
+        stages |= {"tune": self.tune} if self.has_stages and self.partition is not None else {}
+        return [f"{name}.appearance" for name, stage in stages.items() if stage.appearance is None]
+
+    @property
     def length(self) -> int | None:
         """Optimisation steps of the first stage, or of the whole method; None if there are none."""
         return self.pretrain.steps if self.has_stages else self.method.length()

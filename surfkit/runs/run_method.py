@@ -64,7 +64,6 @@ class ReconstructionRecord:
     seconds: float
     cpu_seconds: float
     peak_memory_bytes: int
-    correct_color: bool
     mesh: dict[str, Any] | None
     primitive: Primitive | None
     sh_degree: int
@@ -202,7 +201,6 @@ def reopened(run: Run, given: MethodInput) -> Reconstruction:
         **{name: getattr(kept, name) for name in ("facts", "steps", "seconds", "cpu_seconds")},
         peak_memory_bytes=kept.peak_memory_bytes,
         peak_gpu_bytes=kept.peak_gpu_bytes,
-        correct_color=kept.correct_color,
     )
     return with_drawing(made, given.rasterizer)
 
@@ -236,7 +234,6 @@ def keep(run: Run, made: Reconstruction) -> None:
             cpu_seconds=made.cpu_seconds or 0.0,
             peak_memory_bytes=made.peak_memory_bytes or 0,
             peak_gpu_bytes=made.peak_gpu_bytes or 0,
-            correct_color=made.correct_color,
             mesh=None if made.mesh is None else dump(dict(made.mesh.facts)),
             primitive=made.splats.primitive if made.splats else None,
             sh_degree=made.splats.sh_degree if made.splats else 0,
@@ -359,7 +356,6 @@ def optimised(run: Run, state: StageState) -> Reconstruction:
         cpu_seconds=state.cpu_seconds,
         peak_memory_bytes=state.peak_memory_bytes,
         peak_gpu_bytes=state.peak_gpu_bytes,
-        correct_color=run.color_stage.stage.appearance is not None,
     )
 
 

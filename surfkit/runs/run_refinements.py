@@ -57,8 +57,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     def made() -> Reconstruction:  # made when it is needed, as its activated values take memory
         model = SplatModel(before.primitive, before.stage.finished(given), given.sh_degree, before.stage.near)
-        corrected = run.color_stage_until(before).stage.appearance is not None
-        return with_drawing(Reconstruction(splats=model, correct_color=corrected), ctx.rasterizer)
+        return with_drawing(Reconstruction(splats=model), ctx.rasterizer)
 
     def start(_: torch.Generator) -> InitialModel:
         found = made()

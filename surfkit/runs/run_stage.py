@@ -22,6 +22,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, select
 from surfkit.runs.folder import Run, RunStage
+from surfkit.runs.photo_light import light_of
 from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
@@ -178,8 +179,10 @@ def begin(job: StageJob, trainer: Trainer) -> StageState:
     start, primitive = job.start(generator), job.stage.primitive
     points = Points.fresh(start.params, primitive.shared(), trainer.home)
     points.stats.update({name: points.storage.held(value) for name, value in start.stats.items()})
-    frozen = job.frozen().params if job.frozen else {}
-    state = trainer.begin(points, generator, {name: points.storage.held(value) for name, value in frozen.items()})
+    model = job.stage.stage.appearance
+    light = light_of(job.run, job.scene.train) if model is not None and model.needs_light else None
+    frozen = {name: points.storage.held(value) for name, value in (job.frozen().params if job.frozen else {}).items()}
+    state = trainer.begin(points, generator, frozen, light)
     state.sh_degree = min(start.sh_degree, primitive.sh_degree)
     state.seconds, state.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     if job.before is not None:

@@ -92,6 +92,18 @@ def is_turned(path: Path) -> bool:
         return image.getexif().get(ORIENTATION_TAG, 1) not in (0, 1)
 
 
+def read_exif_tags(path: Path, ifd: int) -> tuple[dict[int, Any], dict[int, Any]]:
+    """The tags of EXIF in a picture, and those of the part of it that has a number; none where it is damaged."""
+    with _picture(path) as image:
+        if image.format == "PNG" and "exif" not in image.info:  # see `is_turned`
+            return {}, {}
+        try:
+            tags = image.getexif()
+            return dict(tags), dict(tags.get_ifd(ifd))
+        except Exception:  # Pillow raises whatever the bytes of a damaged block lead to
+            return {}, {}
+
+
 def read_photo(path: Path, size: tuple[int, int], white: bool = False, pixels: Pixels = DEFAULT_PIXELS) -> Tensor:
     """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter.
 

@@ -63,6 +63,7 @@ class View:
         white: Whether its transparent pixels lie over white, or over black.
         lens: That of the photograph of which `path` is the undistorted picture; None where nothing was distorted.
         pixels: What the values of the file mean.
+        taken_by: Which camera took it: photographs of one camera have the same words here.
     """
 
     name: str
@@ -72,6 +73,7 @@ class View:
     white: bool = False
     lens: Lens | None = None
     pixels: Pixels = DEFAULT_PIXELS
+    taken_by: str = ""
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,8 @@ class MetricColumn:
 TABLE_COLUMNS = {
     "ssim": MetricColumn("SSIM", 3, "higher"),
     "psnr": MetricColumn("PSNR", 2, "higher"),
+    "ssim_aligned": MetricColumn("SSIM, aligned", 3, "higher", by_default=False),
+    "psnr_aligned": MetricColumn("PSNR, aligned", 2, "higher", by_default=False),
     "lpips": MetricColumn("LPIPS", 3, "lower", by_default=False),
     "precision": MetricColumn("P", 3, "higher"),
     "recall": MetricColumn("R", 3, "higher"),

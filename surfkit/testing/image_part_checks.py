@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from surfkit.appearance.base import Appearance
+from surfkit.appearance.base import Appearance, PhotoLight
+from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput
 from surfkit.primitives.surfel2d import Surfel2D
@@ -125,26 +126,34 @@ def _check_number(what: str, value: Tensor, leaves: Mapping[str, Tensor]) -> Non
 
 def check_appearance(appearance: Appearance) -> None:
     """An appearance model begins with numbers that change nothing, gives finite colours that are differentiable in
-    numbers and colours, learns at a rate of 0 or more, and folds its mean into points of the same columns.
+    colours and, if it learns them, in numbers, learns at a rate of 0 or more, and folds its mean into points of the
+    same columns. One that needs the light of photographs begins with it: no change of light is no change of colours.
 
     Args:
         appearance: To check.
     """
     name, draw = type(appearance).__name__, torch.Generator().manual_seed(0)
-    _check_rates(name, [appearance.rate_at(index, 1_000) for index in (1, 500, 1_000)])
+    rates = [appearance.rate_at(*at) for at in ((1, 1_000), (500, 1_000), (1_000, 1_000), (30_000, 30_000))]
+    _check_rates(name, rates)
+    assert any(rates) or appearance.needs_light, f"{name}: the learning rate is 0 throughout, so nothing is learned"
     numbers, color = appearance.begin(5), torch.rand(3, 12, 16, generator=draw)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 15.0, 15.0, 8.0, 6.0, 16, 12)
     assert len(numbers) == 5, f"{name}.begin(5) has {len(numbers)} rows"
     assert torch.isfinite(numbers).all(), f"{name}.begin is not finite"
     assert_same(f"{name}.begin", numbers, appearance.begin(5), DETERMINISM_HINT)
+    if appearance.needs_light:
+        none = PhotoLight(torch.zeros(5, STOPS), torch.zeros(5, OF_CAMERA))
+        assert_same(f"{name}.begin_with, of light that did not change,", numbers, appearance.begin_with(none), "")
     for at, row in enumerate(numbers):
-        same = torch.allclose(appearance(row, color), color, atol=1e-5)
+        same = torch.allclose(appearance(row, color, camera), color, atol=1e-5)
         assert same, f"{name}: the numbers that photograph {at} begins with change its colours"
     moved = (numbers[0] + 0.1 * torch.randn(numbers[0].shape, generator=draw)).requires_grad_()
     with unchanged(name, numbers=moved, color=color):
-        shown = appearance(moved, color.requires_grad_())
+        shown = appearance(moved, color.requires_grad_(), camera)
     assert shown.shape == color.shape, f"{name} gives colours of shape {tuple(shown.shape)}, not {tuple(color.shape)}"
     assert torch.isfinite(shown).all(), f"{name} gives colours that are not finite"
-    for what, leaf in {"numbers": moved, "colours": color}.items():
+    leaves = {"colours": color} | ({"numbers": moved} if any(rates) else {})
+    for what, leaf in leaves.items():
         grad = torch.autograd.grad(shown.square().sum(), leaf, retain_graph=True, allow_unused=True)[0]
         assert grad is not None and grad.any(), f"{name} gives no gradient by the {what}"
         assert torch.isfinite(grad).all(), f"{name}: the gradient by the {what} is not finite"

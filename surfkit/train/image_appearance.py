@@ -10,16 +10,17 @@ from torch import Tensor
 
 from surfkit.appearance.base import Appearance
 from surfkit.primitives.points import Columns
+from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 
 
-def fresh_appearances(model: Appearance, count: int) -> Columns:
-    """The numbers of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often."""
-    value = model.begin(count)
+def fresh_appearances(value: Tensor) -> Columns:
+    """The table of photographs that begin with numbers (V, ...), a row each: "value", Adam's "first" and "second",
+    "shown" so often."""
     moments = {name: torch.zeros_like(value) for name in ("first", "second")}
-    return {"value": value, **moments, "shown": torch.zeros(count, dtype=torch.int64)}
+    return {"value": value, **moments, "shown": torch.zeros(len(value), dtype=torch.int64)}
 
 
 @dataclass
@@ -31,6 +32,7 @@ class ImageAppearance:
         table: The numbers of all photographs (`fresh_appearances`).
         row: The photograph's.
         rate: The learning rate now.
+        camera: That took it.
         numbers: The photograph's, with which gradients can be taken.
         grad: The gradient by them; None before `backward`, and where no loss looks at colours.
     """
@@ -39,6 +41,7 @@ class ImageAppearance:
     table: Columns
     row: int
     rate: float
+    camera: Camera
     numbers: Tensor = field(init=False)
     grad: Tensor | None = field(init=False, default=None)
 
@@ -46,16 +49,16 @@ class ImageAppearance:
         self.numbers = self.table["value"][self.row].clone().requires_grad_()
 
     @classmethod
-    def of_step(cls, stage: Stage, state: StageState, at: int) -> ImageAppearance | None:
+    def of_step(cls, stage: Stage, state: StageState, at: int, camera: Camera) -> ImageAppearance | None:
         """That of photograph `at` in the coming step; None if the stage learns none."""
         if stage.appearance is None:
             return None
         rate = stage.appearance.rate_at(state.index + 1, stage.steps) / 2**state.halvings
-        return cls(stage.appearance, state.appearances, at, rate)
+        return cls(stage.appearance, state.appearances, at, rate, camera)
 
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
-        return self.model(self.numbers.to(color), color)
+        return self.model(self.numbers.to(color), color, self.camera)
 
     def backward(self, losses: list[Tensor]) -> None:
         """Find the gradient of the sum of losses, scalars whose graph stays."""

@@ -46,7 +46,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
 
     # Losses: the maps are compared with the photograph, and with a second view where a loss wants one.
     second = neighbour(setup, state, splats, at, render.maps) if stage.is_paired(index) else None
-    appearance = ImageAppearance.of_step(stage, state, at)
+    appearance = ImageAppearance.of_step(stage, state, at, camera)
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
 

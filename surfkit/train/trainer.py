@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from surfkit.appearance.base import PhotoLight
 from surfkit.core.check import BadInput
 from surfkit.core.events import StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
@@ -41,8 +42,21 @@ class CompletedStep:
 class Trainer(StageSetup):
     """Takes the steps of a stage."""
 
-    def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
-        """The state before the first step; `frozen` as in `StageState`."""
+    def begin(
+        self,
+        points: Points,
+        generator: torch.Generator,
+        frozen: Columns | None = None,
+        light: PhotoLight | None = None,
+    ) -> StageState:
+        """The state before the first step.
+
+        Args:
+            points: To begin with.
+            generator: That of the stage.
+            frozen: As in `StageState`.
+            light: That of the photographs, where the appearance needs it; None begins with numbers that change nothing.
+        """
         declared = set(self.primitive.columns())
         if set(points.all_params()) != declared:
             raise BadInput(
@@ -51,8 +65,9 @@ class Trainer(StageSetup):
             )
         points = points.with_moments(self.stage.optimizer.moment_type())
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
-        if self.stage.appearance is not None:
-            state.appearances = fresh_appearances(self.stage.appearance, len(self.views))
+        if (model := self.stage.appearance) is not None:
+            value = model.begin(len(self.views)) if light is None else model.begin_with(light)
+            state.appearances = fresh_appearances(value)
         state.move(self.rasterizer.where(), self.home)
         return state
 

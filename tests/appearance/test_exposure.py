@@ -3,25 +3,24 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
-from surfkit.evaluate.images.measure_images import color_corrected, evaluate_views
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Maps
 from surfkit.raster.projection import colors
-from surfkit.raster.psnr import psnr
 from surfkit.scene.camera import Camera
-from surfkit.scene.scene import SparsePoints, View
+from surfkit.scene.scene import SparsePoints
+
+CAMERA = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 8.0, 8.0, 16, 16)
 
 
 def test_it_begins_by_changing_nothing():
     color = torch.rand(3, 4, 5)
-    assert torch.equal(Exposure()(Exposure().begin(3)[1], color), color)
+    assert torch.equal(Exposure()(Exposure().begin(3)[1], color, CAMERA), color)
 
 
 def test_it_is_the_matrix_and_the_offset():
     numbers = torch.arange(12.0).view(3, 4) / 10
     color = torch.rand(3, 2, 2)
     expected = numbers[:, :3] @ color[:, 1, 0] + numbers[:, 3]
-    assert torch.allclose(Exposure()(numbers, color)[:, 1, 0], expected)
+    assert torch.allclose(Exposure()(numbers, color, CAMERA)[:, 1, 0], expected)
 
 
 def test_folded_points_have_the_colours_of_the_mean_photograph():
@@ -38,7 +37,7 @@ def test_folded_points_have_the_colours_of_the_mean_photograph():
     before, after = (
         colors(primitive.activate(p, 2), camera) for p in (params, Exposure().folded(numbers, params))
     )  # fmt: skip
-    expected = Exposure()(numbers.mean(0), before.T[:, :, None])[:, :, 0].T
+    expected = Exposure()(numbers.mean(0), before.T[:, :, None], CAMERA)[:, :, 0].T
     assert before.min() > 0 and torch.allclose(after, expected, atol=1e-5)
 
 
@@ -47,16 +46,3 @@ def test_the_rate_falls_evenly_in_the_logarithm():
     assert Exposure().rate_at(500, 1_000) == pytest.approx((1e-2 * 1e-3) ** 0.5)
     with pytest.raises(BadInput, match="0.0"):
         Exposure(end=0.0)
-
-
-def test_correction_finds_the_change_of_colour():
-    draw = torch.Generator().manual_seed(1)
-    photo = torch.rand(3, 20, 30, generator=draw)
-    change = torch.eye(3) + 0.2 * torch.rand(3, 3, generator=draw)
-    render = torch.einsum("ij,jhw->ihw", change, photo) - 0.1
-    assert psnr(color_corrected(render, photo), photo) > 90 > psnr(render, photo)
-    assert torch.isfinite(color_corrected(torch.zeros(3, 4, 4), torch.rand(3, 4, 4))).all()
-    view = View("a.png", Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 15.0, 10.0, 30, 20), None)
-    found = evaluate_views([view], [(photo * 255).byte()], lambda _: Maps(color=0.5 * photo), correct_color=True)
-    assert found["images"]["psnr_corrected"] > 40 > found["images"]["psnr"]
-    assert found["images"]["per_image"]["a.png"].keys() == {"psnr", "ssim", "psnr_corrected"}

@@ -73,7 +73,8 @@ def test_perfect_renders():
 
 
 def test_without_views_there_are_no_numbers():
-    assert evaluate_views([], [], drawn) == {"images": {"psnr": None, "ssim": None, "per_image": {}}, "fps": None}
+    names = ("psnr", "ssim", "psnr_aligned", "ssim_aligned")
+    assert evaluate_views([], [], drawn) == {"images": {**dict.fromkeys(names), "per_image": {}}, "fps": None}
 
 
 def test_speed_counts_after_the_warmup():

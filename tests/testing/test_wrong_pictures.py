@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 import torch
 
-from surfkit.appearance import Exposure
+from surfkit.appearance import CameraResponse, Exposure
 from surfkit.depth.base import DepthEstimator, Estimate
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.testing import check_appearance, check_depth_estimator, check_loss, check_regularizer
@@ -173,13 +173,23 @@ class Darkens(Exposure):
 
 
 class Unlearned(Exposure):
-    def __call__(self, numbers, color):
-        return Exposure.__call__(self, numbers.detach(), color)
+    def __call__(self, numbers, color, camera):
+        return Exposure.__call__(self, numbers.detach(), color, camera)
+
+
+class Idles(Exposure):
+    def rate_at(self, index, steps):
+        return 0.0
 
 
 class Reverses(Exposure):
     def rate_at(self, index, steps):
         return -Exposure.rate_at(self, index, steps)
+
+
+class Starts(CameraResponse):
+    def begin_with(self, light):
+        return CameraResponse.begin_with(self, light) + 0.1
 
 
 class Spills(Exposure):
@@ -198,6 +208,8 @@ class Loses(Exposure):
     [
         (Darkens(), "Darkens: .*photograph 0 .*colours"),
         (Unlearned(), "Unlearned gives no gradient by the numbers"),
+        (Idles(), "Idles: the learning rate is 0 throughout, so nothing is learned"),
+        (Starts(), "Starts.begin_with, of light that did not change"),
         (Reverses(), "Reverses: .* -0.00.*0 or more"),
         (Spills(), r"Spills.folded changed .*params\['sh0'\]"),
         (Loses(), "Loses.folded gives columns of shapes {'sh0'"),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.plugin import SH_C0, Appearance, BadInput, Columns, Primitive, Steps, name_of
+from surfkit.plugin import SH_C0, Appearance, BadInput, Camera, Columns, Primitive, Steps, name_of
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class GainOffset(Appearance):
     def rate_at(self, index: int, steps: int) -> float:
         return self.rate if index > self.start else 0.0
 
-    def __call__(self, numbers: Tensor, color: Tensor) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         return numbers[0].exp() * color + numbers[1]
 
     def folded(self, numbers: Tensor, params: Columns) -> Columns:

@@ -131,7 +131,7 @@ def test_losses_and_exposure_keep_to_their_contracts():
 def test_exposure_is_one_gain_and_offset_and_is_folded_as_their_mean():
     draw, model = torch.Generator().manual_seed(0), GainOffset()
     color, numbers = torch.rand(3, 4, 5, generator=draw), torch.randn(7, 2, generator=draw) * 0.3
-    assert torch.allclose(model(numbers[2], color), math.exp(numbers[2, 0]) * color + numbers[2, 1])
+    assert torch.allclose(model(numbers[2], color, camera()), math.exp(numbers[2, 0]) * color + numbers[2, 1])
     params = {"sh0": torch.randn(9, 1, 3, generator=draw), "sh_rest": torch.randn(9, 3, 3, generator=draw)}
     basis = torch.randn(3, generator=draw)
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from surfkit.apps.doctor.estimate import ResourceEstimate
 from surfkit.apps.doctor.examine_photos import Photograph, PhotoToExamine, look_at
-from surfkit.apps.doctor.exposure_spread import exposures
 from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding, of_each
 from surfkit.apps.doctor.gather import Gathered, gather
 from surfkit.apps.doctor.geometry import Geometry, seen_by, survey
+from surfkit.apps.doctor.light import uneven_light
 from surfkit.apps.doctor.priors import priors
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
@@ -37,10 +37,8 @@ from surfkit.scene.photos import refuse_large
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-BRIGHTNESS_POINTS = 1_000
-"""Sparse points at which the brightness of photographs is compared."""
-UNEVEN_STOPS = 1.0
-"""Spread of exposures, from the 10th to the 90th percentile, that a single colour of each point cannot explain."""
+COLORED_POINTS = 1_000
+"""Sparse points at which the colours of photographs are compared."""
 MAX_INVERTED_SHARE = 0.2
 """A mask that keeps less is probably inverted, if most masks are so."""
 
@@ -112,7 +110,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_split(data, gathered),
         *_groups(gathered),
         *_untied(gathered),
-        *_exposure(gathered, known, recipe),
+        *uneven_light(gathered, known, geometry.sample[:COLORED_POINTS], recipe),
         *priors(data, gathered, recipe, quick),
     ]
     findings.sort(key=lambda finding: FINDING_LEVELS.index(finding.level))
@@ -123,7 +121,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
 
 def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None) -> dict[Path, Photograph]:
     """A look at every photograph that is there; at those without a pose only where nothing has one."""
-    compared = geometry.sample[:BRIGHTNESS_POINTS]
+    compared = geometry.sample[:COLORED_POINTS]
     wanted = [
         PhotoToExamine(
             shot.path,
@@ -240,27 +238,6 @@ def _untied(gathered: Gathered) -> list[Finding]:
     found = gathered.capture.untied(gathered.held_out)
     text = untied_warning(found)
     return [Finding("warning", "untied", text, tuple(found))] if text else []
-
-
-def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:
-    """Photographs that show the same places differently bright."""
-    bright = {name: look.brightness for name, look in known.items() if look.brightness is not None and not look.flat}
-    names = list(bright)
-    if len(names) < 3:
-        return []
-    stops = exposures(np.stack(list(bright.values())))
-    if not np.isfinite(stops).any():
-        return []
-    low, high = np.nanpercentile(stops, [10, 90])
-    if high - low < UNEVEN_STOPS or not recipe.has_stages or recipe.pretrain.appearance is not None:
-        return []
-    order = np.argsort(np.nan_to_num(stops))
-    text = (
-        f"the same places differ in brightness by {high - low:.1f} stops between photographs, "
-        f"from {names[order[0]]!r}, the darkest, to {names[order[-1]]!r}: "
-        "add pretrain.appearance:exposure, which learns an exposure for each"
-    )
-    return [Finding("warning", "exposure", text)]
 
 
 def _found(data: Data, gathered: Gathered, geometry: Geometry, looks: dict[Path, Photograph]) -> dict[str, str]:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from surfkit.apps.doctor.exposure_spread import luminance
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.masks import check_mask, read_mask
 from surfkit.scene.photos import open_header, read_draft
@@ -39,7 +38,7 @@ class Photograph:
         mask_fault: The same of its mask.
         kept: Share of the pixels that its mask keeps; None without a mask.
         flat: Whether all of it has one colour.
-        brightness: (S,) float32, log2 of the linear luminance at the places asked for; NaN elsewhere. None if unknown.
+        colors: (S, 3) float32 in [0, 1] at the places asked for; NaN where they lie outside. None if unknown.
     """
 
     bytes: int = 0
@@ -50,7 +49,7 @@ class Photograph:
     mask_fault: str | None = None
     kept: float | None = None
     flat: bool = False
-    brightness: np.ndarray | None = None
+    colors: np.ndarray | None = None
 
 
 Places = Callable[[], np.ndarray]
@@ -64,7 +63,7 @@ class PhotoToExamine:
     Attributes:
         path: Of the photograph.
         mask: Its mask.
-        places: Where the brightness is wanted, if anywhere.
+        places: Where the colours are wanted, if anywhere.
         pixels: What the values of the photograph mean.
     """
 
@@ -114,7 +113,17 @@ def _header(image: Image.Image) -> dict:
 
 def _pixels(pixels: np.ndarray, places: Places | None) -> dict:
     flat = bool(np.ptp(pixels.reshape(-1, 3), axis=0).max() <= 2)
-    return {"flat": flat, "brightness": None if places is None else luminance(pixels, places())}
+    return {"flat": flat, "colors": None if places is None else _colors(pixels, places())}
+
+
+def _colors(pixels: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(S, 3) float32 in [0, 1] of a picture (h, w, 3) uint8 at places (S, 2), NaN outside."""
+    height, width = pixels.shape[:2]
+    found = np.full((len(places), 3), np.nan, np.float32)
+    inside = np.isfinite(places).all(1)
+    x, y = (np.minimum((places[inside, axis] * size).astype(int), size - 1) for axis, size in ((0, width), (1, height)))
+    found[inside] = pixels[y, x] / np.float32(255)
+    return found
 
 
 def _mask(mask: Mask, size: tuple[int, int] | None, quick: bool) -> dict:

@@ -108,8 +108,9 @@ class Quantity:
 
 QUANTITIES = {
     "psnr": Quantity("PSNR, dB", (("images", "psnr"),), 2),
-    "psnr_corrected": Quantity("PSNR, colours corrected", (("images", "psnr_corrected"),), 2),
+    "psnr_aligned": Quantity("PSNR, colours aligned, dB", (("images", "psnr_aligned"),), 2),
     "ssim": Quantity("SSIM", (("images", "ssim"),)),
+    "ssim_aligned": Quantity("SSIM, colours aligned", (("images", "ssim_aligned"),)),
     "lpips": Quantity("LPIPS", (("images", "lpips"), ("images", "lpips_vgg"))),
     "precision": Quantity("precision", (("geometry", "precision"),)),
     "recall": Quantity("recall", (("geometry", "recall"),)),

@@ -42,18 +42,33 @@ def mean_ssim(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> floa
     return float(ssim_map(render, torch.where(mask, photo, render))[:, mask].mean())
 
 
-def color_corrected(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The render after the affine change of colour that brings it closest to the photograph, both (3, H, W).
+def aligned_halves(
+    render: Tensor, photo: Tensor, mask: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor | None] | None:
+    """The right half of a render with its colours aligned, and those of photograph and mask; None where a half has no
+    pixel that counts.
 
-    For photographs of changing exposure: what a held-out one's own exposure was is not known from training. With a
-    mask (H, W) bool, only pixels where it is True decide.
+    What the light of a held-out photograph was is not known from training. The colours get the affine change that
+    brings the left half of the render closest to that of the photograph: what is measured on the right half has not
+    seen its own answer (after NeRF in the Wild, Martin-Brualla et al. 2021, which fits its appearance so).
+
+    Args:
+        render: (3, H, W) in [0, 1].
+        photo: (3, H, W) in [0, 1].
+        mask: (H, W) bool, whether a pixel counts; None for all.
     """
-    colors, wanted = render.flatten(1).double().T, photo.flatten(1).double().T
+    middle = render.shape[2] // 2
+    left = [image[:, :, :middle] for image in (render, photo)]
+    if mask is not None:
+        left = [image[:, mask[:, :middle]] for image in left]
+    if not left[0].numel() or (mask is not None and not mask[:, middle:].any()):
+        return None
+    colors, wanted = (image.flatten(1).double().T for image in left)
     inputs = torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
-    known = slice(None) if mask is None else mask.flatten()
-    damped = inputs[known].T @ inputs[known] + 1e-9 * torch.eye(4).to(inputs)  # one colour has no unique answer
-    change = torch.linalg.solve(damped, inputs[known].T @ wanted[known])
-    return (inputs @ change).T.reshape(render.shape).to(render)
+    damped = inputs.T @ inputs + 1e-9 * torch.eye(4).to(inputs)  # one colour has no unique answer
+    change = torch.linalg.solve(damped, inputs.T @ wanted).to(render)
+    right = torch.einsum("ci,chw->ihw", change[:3], render[:, :, middle:]) + change[3, :, None, None]
+    return right.clamp(0, 1), photo[:, :, middle:].contiguous(), None if mask is None else mask[:, middle:]
 
 
 def evaluate_views(
@@ -63,13 +78,13 @@ def evaluate_views(
     *,
     timed: Draw | None = None,
     show: Show | None = None,
-    correct_color: bool = False,
     masks: Sequence[Tensor | None] | None = None,
     networks: Sequence[Perceptual] = (),
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
-    A photograph that cannot be read, or whose mask cannot, is left out, and `PhotoSkipped` tells so.
+    Both are measured of the colours as they are, and as "psnr_aligned" and "ssim_aligned" of `aligned_halves`. A
+    photograph that cannot be read, or whose mask cannot, is left out, and `PhotoSkipped` tells so.
 
     Args:
         views: Held-out views.
@@ -77,10 +92,9 @@ def evaluate_views(
         draw: Makes the renders that are measured and shown.
         timed: Makes the renders whose speed counts, where it is not `draw`: colours only, for one.
         show: Called once a view, to write pictures.
-        correct_color: Also measure "psnr_corrected", of `color_corrected` renders.
         masks: Which pixels count, by position in `views`; a view without any is shown but not measured.
-        networks: Of LPIPS: also measure "lpips_NET" as defined, and "lpips_NET_unscaled" as the published tables of
-            Gaussian splatting have it.
+        networks: Of LPIPS: also measure "lpips_NET" as defined, "lpips_NET_unscaled" as the published tables of
+            Gaussian splatting have it, and "lpips_NET_aligned".
     """
     per_image = {}
     for at, view in enumerate(views):
@@ -94,20 +108,26 @@ def evaluate_views(
             color = maps.need("color")
             render, target = color.clamp(0, 1), photo.to(color) / 255
             mask = None if mask is None else mask.to(render.device)
-            per_image[view.name] = _measured(render, target, mask, correct_color)
-            per_image[view.name] |= lpips_values(networks, render, target, mask)
+            per_image[view.name] = _measured(render, target, mask, networks)
         if show is not None:
             show(view, photo, maps)
-    names = ("psnr", "ssim", *["psnr_corrected"] * correct_color, *lpips_names(networks))
-    means = {name: _mean([values[name] for values in per_image.values()]) for name in names}
+    names = ("psnr", "ssim", *lpips_names(networks), *aligned_names(networks))
+    means = {name: _mean([values[name] for values in per_image.values() if name in values]) for name in names}
     return {"images": {**means, "per_image": per_image}, "fps": frames_per_second(views, timed or draw)}
 
 
-def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color: bool) -> dict[str, float]:
+def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, networks: Sequence[Perceptual]) -> dict[str, float]:
     found = {"psnr": psnr(render, photo, mask), "ssim": mean_ssim(render, photo, mask)}
-    if correct_color:
-        found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)
+    found |= lpips_values(networks, render, photo, mask)
+    if (halves := aligned_halves(render, photo, mask)) is not None:
+        values = psnr(*halves), mean_ssim(*halves), *(network.distance(*halves) for network in networks)
+        found |= dict(zip(aligned_names(networks), values, strict=True))
     return found
+
+
+def aligned_names(networks: Sequence[Perceptual]) -> list[str]:
+    """Names of what is measured of `aligned_halves`."""
+    return ["psnr_aligned", "ssim_aligned", *(f"lpips_{network.net}_aligned" for network in networks)]
 
 
 def lpips_values(

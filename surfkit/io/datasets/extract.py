@@ -45,6 +45,7 @@ class ExtractedView:
     size: tuple[int, int]
     bent: Lens | None = None
     pixels: Pixels = DEFAULT_PIXELS
+    taken_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,17 @@ def save(path: Path, made: Extract) -> None:
     """Write an extract."""
     scene, frame = made.scene, made.scene.frame
     shots = tuple(
-        ExtractedView(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height), v.lens, v.pixels)
+        ExtractedView(
+            v.name,
+            v.path,
+            v.mask,
+            v.white,
+            (c.fx, c.fy, c.cx, c.cy),
+            (c.width, c.height),
+            v.lens,
+            v.pixels,
+            v.taken_by,
+        )
         for v in scene.train
         for c in [v.camera]
     )
@@ -113,7 +124,16 @@ def load(path: Path) -> Extract:
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:
     facts = load_value(ExtractHeader, from_json(str(arrays["facts"])))
     views = tuple(
-        View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white, s.bent, s.pixels)
+        View(
+            s.name,
+            Camera(torch.from_numpy(pose), *s.lens, *s.size),
+            s.path,
+            s.mask,
+            s.white,
+            s.bent,
+            s.pixels,
+            s.taken_by,
+        )
         for s, pose in zip(facts.shots, arrays["poses"], strict=True)
     )
     frame = Frame(arrays["origin"], facts.scale, facts.metres, facts.crs, facts.shift)

@@ -34,6 +34,7 @@ from surfkit.io.datasets.panoramas import (
     view_sizes,
     views_of,
 )
+from surfkit.io.datasets.photo_cameras import cameras_of
 from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.record3d import PACKED_SUFFIX
@@ -335,10 +336,11 @@ def _views(
                 "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
             )
         )
+    taken_by = cameras_of(shots)
     lenses = [None if is_pinhole(p.camera) or is_panorama(p.camera) else lens_of(p.camera, p.size) for p in given]
     return [
-        (shot.name, _view(part, picture, lens, frame))
-        for shot, parts, lens in zip(shots, made, lenses, strict=True)
+        (shot.name, _view(part, picture, lens, name, frame))
+        for shot, parts, lens, name in zip(shots, made, lenses, taken_by, strict=True)
         for part, picture in parts
     ]
 
@@ -363,7 +365,7 @@ def check_size(shot: RawImage, size: tuple[int, int]) -> None:
     )
 
 
-def _view(shot: RawImage, picture: DistortedPhoto, bent: Lens | None, frame: Frame) -> View:
+def _view(shot: RawImage, picture: DistortedPhoto, bent: Lens | None, taken_by: str, frame: Frame) -> View:
     lens = picture.camera
     full = Camera(
         world_to_camera=frame.local_pose(shot.pose),
@@ -374,7 +376,8 @@ def _view(shot: RawImage, picture: DistortedPhoto, bent: Lens | None, frame: Fra
         width=int(lens.width),
         height=int(lens.height),
     )
-    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white, bent, picture.pixels)
+    camera, mask = full.resized(*picture.size), picture.mask
+    return View(shot.name, camera, picture.path, mask, picture.white, bent, picture.pixels, taken_by)
 
 
 def _shares(pixels: np.ndarray, lens: Any, camera: Camera) -> np.ndarray:

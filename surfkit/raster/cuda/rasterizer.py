@@ -161,7 +161,7 @@ class RasterPass:
 
     @cached_property
     def lists(self) -> tuple[RasterView, Tensor, Tensor, Tensor]:
-        """Write the records, and list them by tile, (slots, 2) of them; sets `tints`, too."""
+        """The view, the records, entries (S, 2) by tile, and where those of each tile begin; sets `tints`, too."""
         shape, count, slots, project = self.arrays[0].new_empty(0), len(self.index), self.slots, self._project
         records = shape.new_empty(count * RECORD_BYTES[self.kind], dtype=torch.uint8)
         number = torch.int16 if self.tile_bytes == 2 else torch.int32

@@ -14,6 +14,7 @@ void add_stereo(nanobind::module_& m);
 void add_compress(nanobind::module_& m);
 void add_texture(nanobind::module_& m);
 void add_start(nanobind::module_& m);
+void add_appearance(nanobind::module_& m);
 
 namespace {
 
@@ -43,4 +44,5 @@ NB_MODULE(_native, m) {
     surfkit::add_compress(m);
     surfkit::add_texture(m);
     surfkit::add_start(m);
+    surfkit::add_appearance(m);
 }

@@ -16,6 +16,7 @@ from surfkit.runs.blocks.block import BlockRun, consensus_of
 from surfkit.runs.blocks.oom_retry import reduction
 from surfkit.runs.blocks.rounds import AgreedMerge, finished_piece
 from surfkit.runs.context import RunContext
+from surfkit.runs.photo_light import light_of
 from surfkit.train import checkpoint, streaming
 from surfkit.train.image_appearance import fresh_appearances
 from surfkit.train.stage import Stage
@@ -72,8 +73,10 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
     state.peak_gpu_bytes = max(part.peak_gpu_bytes for part in parts)
     state.sh_degree = max(part.sh_degree for part in parts)
-    if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
-        state.appearances = fresh_appearances(recipe.tune.appearance, len(ctx.scene.train))
+    if (model := recipe.tune.appearance) is not None:  # what blocks learned is folded into their colours
+        views = ctx.scene.train
+        known = model.begin_with(light_of(ctx.run, views)) if model.needs_light else model.begin(len(views))
+        state.appearances = fresh_appearances(known)
     return state
 
 

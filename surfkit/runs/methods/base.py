@@ -39,7 +39,6 @@ class Reconstruction:
         cpu_seconds: CPU time of all threads, likewise.
         peak_memory_bytes: Most memory held, likewise.
         peak_gpu_bytes: Most memory of the GPU held, likewise; 0 without one.
-        correct_color: Whether to measure PSNR after a colour correction too, as training let photographs differ.
     """
 
     mesh: Mesh | None = None
@@ -55,7 +54,6 @@ class Reconstruction:
     cpu_seconds: float | None = None
     peak_memory_bytes: int | None = None
     peak_gpu_bytes: int | None = None
-    correct_color: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Made-up data sets with one fault and with all of them: each is told, in one go, and nothing is written."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -366,6 +367,8 @@ def test_what_depends_on_the_recipe(farm):
     brightened(farm)
     learning = evolve(recipes()["2dgs"], "pretrain.appearance", Exposure())
     assert "exposure" not in told(farm, learning)
+    blocks = told(farm, "2dgs-blocks")["exposure"][0].text
+    assert "pretrain.appearance:exposure tune.appearance:exposure" in blocks and "surfkit prepare points" in blocks
     assert "there are no depth priors" in told(farm, "citygs2-coarse")["depth-priors"][0].text
     (farm / "estimated_depths").mkdir()
     np.save(farm / "estimated_depths" / "view_001.png.npy", np.ones((3, 4), np.float32))
@@ -481,3 +484,17 @@ def test_masks_beside_photographs_are_no_unused_pictures(farm):
     assert told(moved) == {}
     paint("images/more.png", np.zeros((9, 9), np.uint8))(moved)
     assert told(moved)["unused-pictures"][0].names == ("images/more.png",)
+
+
+def test_light_that_differs_is_told_with_figures(tmp_path):
+    folder = tmp_path / "tracked"
+    write_colmap(folder, photograph(FLIGHT), tracks=True)
+    assert "exposure" not in told(folder)
+    brightened(folder)
+    (light,) = told(folder)["exposure"]
+    assert light.level == "warning" and "add pretrain.appearance:camera-response" in light.text
+    stops = re.search(r"exposures differ by (\d.\d) stops and white balance by", light.text)
+    assert 1.7 <= float(stops[1]) <= 2.1, "as they were made darker"
+    darkest = re.search("'view_(\\d+).png' is the darkest", light.text)
+    assert int(darkest[1]) % 2 == 0, "every other one, from the first on"
+    assert "exposure" not in told(folder, quick=True)

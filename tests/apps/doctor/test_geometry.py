@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from surfkit.apps.doctor.coverage_gaps import holes
-from surfkit.apps.doctor.exposure_spread import exposures, luminance
 from surfkit.apps.doctor.geometry import places
 from surfkit.io.datasets.raw_dataset import RawImage, load_pycolmap
 
@@ -30,27 +29,6 @@ def test_places_follow_the_lens_and_far_rays_do_not_fold_back():
     assert found[0] == pytest.approx([(50 * 0.5 * (1 - 0.1 * 0.25) + 50) / 100, 0.5])
     folded = (50 * 4 * (1 - 0.05 * 16) + 50) / 100
     assert 0 < folded < 1 and np.isnan(places(shot("SIMPLE_RADIAL", 50, 50, 40, -0.05), xyz)[0][1]).all()
-
-
-def test_luminance_is_linear_and_nothing_outside():
-    pixels = np.zeros((4, 4, 3), np.uint8)
-    pixels[1, 2], pixels[3, 3] = 188, (255, 0, 0)
-    found = luminance(pixels, np.array([[0.6, 0.3], [1.0, 1.0], [np.nan, np.nan], [0.0, 0.0]]))
-    assert 2 ** found[[0, 1, 3]] - 0.005 == pytest.approx([0.503, 0.2126, 0], abs=2e-3)  # 188 is half the light
-    assert np.isnan(found[2])
-
-
-def test_exposures_are_recovered_where_contents_differ_and_some_places_are_hidden():
-    draw = np.random.default_rng(0)
-    gains, places_ = draw.normal(0, 0.7, 30), draw.normal(-3, 2, 400)
-    seen = gains[:, None] + places_ + draw.normal(0, 0.1, (30, 400))
-    seen = np.where(draw.random((30, 400)) < 0.1, draw.normal(-3, 2, (30, 400)), seen)  # something stands before it
-    seen[draw.random((30, 400)) < 0.6] = np.nan
-    seen[7, 5:] = np.nan
-    found = exposures(seen.astype(np.float32))
-    known = np.arange(30) != 7
-    assert np.isnan(found[7])
-    assert found[known] - np.median(found[known]) == pytest.approx(gains[known] - np.median(gains[known]), abs=0.15)
 
 
 def test_a_hole_is_told_where_it_is_also_far_from_the_origin():

@@ -234,7 +234,7 @@ def test_a_longer_coarse_stage_makes_the_old_result_void(undisturbed, data, reci
 def test_exposures_of_blocks_are_folded(data, recipe, tmp_path):
     tune = replace(recipe.tune, appearance=Exposure())
     metrics = run(replace(recipe, tune=tune), data, tmp_path, Compute("cpu"), EVERY)
-    assert metrics["images"]["psnr_corrected"] > 8 and load_run(tmp_path)[1].appearances
+    assert metrics["images"]["psnr_aligned"] > 8 and load_run(tmp_path)[1].appearances
 
 
 def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit.appearance import Exposure
 from surfkit.apps.run_summary import result_rows
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
@@ -21,7 +20,6 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
-from surfkit.runs import measure_run as measure
 from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
@@ -224,19 +222,6 @@ def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
     short = replace(recipe, partition=None, refine=(PruneAndRecover(stage=depth),))
     run(evolve(short, "pretrain.losses", depth.losses), data, tmp_path, Compute("cpu"), EVERY)
     assert capsys.readouterr().err.count("has no depth priors") == 1
-
-
-@pytest.mark.parametrize(("taught", "corrected"), [(True, True), (False, False)])
-def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkeypatch, taught, corrected):
-    """By the last stage that was shown any: one that is taught keeps what was learnt of them."""
-    found, original = [], measure.evaluate_views
-    monkeypatch.setattr(
-        measure, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
-    )
-    stage = Stage(steps=2, sh_every=1)
-    refine = (DistilSH if taught else PruneAndRecover)(stage=stage)
-    run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Compute("cpu"), EVERY)
-    assert found == [True, corrected], "before and after"
 
 
 def test_depth_priors_teach_nothing_where_the_model_does():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from surfkit.plugin import Appearance, BadInput, Columns, Primitive, log_linear
+from surfkit.plugin import Appearance, BadInput, Camera, Columns, Primitive, log_linear
 from torch import Tensor
 
 SH0 = 0.28209479177387814
@@ -41,7 +41,7 @@ class NewPart(Appearance):
         """From `start` to `end`, along a straight line in the logarithm."""
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, numbers: Tensor, color: Tensor) -> Tensor:
+    def __call__(self, numbers: Tensor, color: Tensor, camera: Camera) -> Tensor:
         """(3, H, W) the colours times their factors."""
         return color * numbers.exp()[:, None, None]
 

@@ -1,0 +1,56 @@
+"""How differently photographs show the same places: exposure, white balance, dark corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from surfkit.appearance.track_light import MIN_SEEN, LightSpread, TrackColors, fit_light
+from surfkit.apps.doctor.examine_photos import Photograph
+from surfkit.apps.doctor.finding import Finding
+from surfkit.apps.doctor.gather import Gathered
+from surfkit.apps.doctor.geometry import seen_by
+from surfkit.io.datasets.photo_cameras import cameras_of
+from surfkit.runs.recipe import Recipe
+
+MIN_PHOTOGRAPHS = 3
+"""Photographs that are compared, at least."""
+
+
+def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.ndarray, recipe: Recipe) -> list[Finding]:
+    """A warning where light differs between photographs and the recipe learns nothing of it.
+
+    Sparse points are looked for in all photographs whose cameras have them in view. Those that something hides there
+    are told by their colours, which fit no others.
+
+    Args:
+        gathered: The data set.
+        known: A look at its photographs, with the colours at the points, by name.
+        xyz: (S, 3) the points, input frame.
+        recipe: To train by.
+    """
+    looks = {name: look for name, look in known.items() if look.colors is not None and not look.flat}
+    shots = [shot for shot in gathered.capture.shots if shot.name in looks]
+    if len(shots) < MIN_PHOTOGRAPHS or not recipe.without_appearance:
+        return []
+    parts = []
+    for at, shot in enumerate(shots):
+        camera, share = shot.camera, seen_by(shot, xyz)()
+        rows = np.flatnonzero(np.isfinite(share).all(1))
+        size = np.array([camera.width, camera.height])
+        middle = np.array([camera.principal_point_x, camera.principal_point_y])
+        place = (share[rows] * size - middle) * 2 / np.hypot(*size)
+        parts.append((np.full(len(rows), at), rows, place, looks[shot.name].colors[rows]))
+    names = cameras_of(shots)
+    cameras = {name: row for row, name in enumerate(dict.fromkeys(names))}
+    colors = TrackColors(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    light = fit_light(colors, np.array([cameras[name] for name in names]))
+    spread = LightSpread.of(light)
+    if not spread.is_uneven:
+        return []
+    exposure = np.where(light.seen >= MIN_SEEN, light.stops.mean(1), 0)
+    darkest, brightest = shots[int(exposure.argmin())].name, shots[int(exposure.argmax())].name
+    text = spread.remedy(bool(gathered.capture.groups), recipe.without_appearance)
+    text = f"{darkest!r} is the darkest photograph and {brightest!r} the brightest, and {text}"
+    return [Finding("warning", "exposure", text)]

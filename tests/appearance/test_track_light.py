@@ -1,0 +1,146 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from surfkit.appearance.response import curved
+from surfkit.appearance.track_light import (
+    MIN_SEEN,
+    LightSpread,
+    TrackColors,
+    fit_light,
+    rows_of,
+    track_colors,
+)
+from surfkit.scene.camera import Camera
+from surfkit.scene.observations import Observations, Observations2D
+from surfkit.scene.scene import View
+from surfkit.scene.srgb import from_linear, linear
+
+PHOTOS, POINTS = 30, 400
+CORNER, BALANCE = 0.5, 0.15
+
+
+def world(curves=((0.0, 0.0, 0.0),), seed=0):
+    """Colours of points in photographs that each show a part of them, and the truth: (V, 3) stops, (V,) cameras."""
+    draw = np.random.default_rng(seed)
+    light = linear(draw.uniform(0.15, 0.6, (POINTS, 3)))
+    stops = draw.uniform(-1.2, 1.2, (PHOTOS, 1)) + np.log2(draw.uniform(1 - BALANCE, 1 + BALANCE, (PHOTOS, 3)))
+    taken_by = np.arange(PHOTOS) % len(curves)
+    seen = draw.random((PHOTOS, POINTS)) < 0.3
+    photo, point = np.nonzero(seen)
+    place = draw.uniform(-0.7, 0.7, (len(photo), 2))
+    left = 1 - (1 - CORNER) * (place**2).sum(1)
+    encoded = from_linear((light[point] * 2 ** stops[photo] * left[:, None]).clip(0, 1))
+    color = curved(encoded, np.array(curves)[taken_by[photo]].T[..., None])
+    return TrackColors(photo, point, place, color), stops - stops.mean(0), taken_by
+
+
+def corner_light(camera):
+    r2 = np.linspace(0, 1, 21)
+    return 2 ** -(camera[0] * r2 + camera[1] * r2**2 + camera[2] * r2**3) - (1 - (1 - CORNER) * r2)
+
+
+def test_exposure_balance_and_vignetting_are_found():
+    colors, stops, taken_by = world()
+    light = fit_light(colors, taken_by)
+    assert np.abs(light.stops - stops).max() < 0.01  # 0.7 % of the light
+    assert np.abs(corner_light(light.cameras[0])).max() < 0.01
+    assert not light.cameras[0, 5:].any() and np.abs(light.cameras[0, 3:5]).max() < 0.01
+    assert light.deviation < 0.005 and (light.seen > 50).all()
+
+
+def test_a_quarter_of_wrong_sights_and_noise_change_little():
+    colors, stops, taken_by = world()
+    draw = np.random.default_rng(1)
+    color = (colors.color + draw.normal(0, 0.02, colors.color.shape)).clip(0, 1)
+    wrong = draw.random(len(color)) < 0.25
+    color[wrong] = draw.random((wrong.sum(), 3))
+    light = fit_light(TrackColors(colors.photo, colors.point, colors.place, color), taken_by)
+    assert np.sqrt(((light.stops - stops) ** 2).mean()) < 0.03
+    assert np.abs(corner_light(light.cameras[0])).max() < 0.03
+    assert 0.01 < light.deviation < 0.08
+
+
+def test_curves_of_two_cameras_are_told_apart():
+    one, other = (0.3, -0.1, 0.05), (-0.3, 0.1, -0.05)
+    colors, _, taken_by = world((one, other))
+    light = fit_light(colors, taken_by)
+    at = np.linspace(0.05, 0.9, 20)
+    for curve, truth in zip(light.cameras[:, 5:], (one, other), strict=True):
+        assert np.abs(curved(at, curve) - curved(at, truth)).max() < 0.02
+    assert np.abs(light.cameras[:, 5:].mean(0)).max() < 1e-3
+    assert light.deviation < 0.005
+    spread = LightSpread.of(light)
+    assert spread.curve == pytest.approx(np.abs(curved(at, one) - at).max(), abs=0.02)
+    assert "response curves of 2 cameras by" in str(spread)
+
+
+def test_photographs_that_share_too_little_are_known_by_their_count():
+    colors, stops, taken_by = world()
+    few = np.flatnonzero(colors.photo == 4)[MIN_SEEN - 4 :]
+    kept = np.setdiff1d(np.arange(len(colors.photo)), [*few, *np.flatnonzero(colors.photo == 9)])
+    light = fit_light(TrackColors(*(each[kept] for each in vars(colors).values())), taken_by)
+    assert (
+        light.seen[4] < MIN_SEEN
+        and light.seen[9] == 0
+        and light.stops[9] == pytest.approx(light.stops[9].mean(), abs=0.2)
+    )
+    others = np.setdiff1d(np.arange(PHOTOS), [4, 9])
+    off = (light.stops - stops)[others]
+    assert np.abs(off - off.mean(0)).max() < 0.02
+    spread = LightSpread.of(light)
+    low, high = np.percentile(stops[others].mean(1), [10, 90])
+    assert spread.stops == pytest.approx(high - low, abs=0.05) and spread.corner == pytest.approx(CORNER, abs=0.01)
+    low, high = np.percentile(stops[others][:, [0, 2]] - stops[others][:, 1:2], [10, 90], axis=0)
+    assert spread.balance == pytest.approx(2 ** (high - low).max() - 1, abs=0.02) and spread.is_uneven
+    assert f"differ by {spread.stops:.1f} stops" in str(spread) and "have 50% of the light" in str(spread)
+
+
+@pytest.mark.parametrize(
+    ("figures", "uneven"),
+    [
+        ((0.49, 0.09, 0.81, 0.029), False),
+        ((0.5, 0.0, 1.0, 0.0), True),
+        ((0.0, 0.1, 1.0, 0.0), True),
+        ((0.0, 0.0, 0.8, 0.0), True),
+        ((0.0, 0.0, 1.0, 0.03), True),
+    ],
+)
+def test_light_is_uneven_from_stated_limits_on(figures, uneven):
+    assert LightSpread(*figures).is_uneven == uneven
+
+
+def test_nothing_seen_changes_nothing():
+    empty = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
+    light = fit_light(empty, np.zeros(3, int))
+    assert not light.stops.any() and not light.cameras.any() and not light.seen.any()
+
+
+def test_the_same_twice():
+    colors, _, taken_by = world()
+    one, other = (fit_light(colors, taken_by) for _ in range(2))
+    assert np.array_equal(one.stops, other.stops) and np.array_equal(one.cameras, other.cameras)
+
+
+def test_colours_are_read_where_the_points_are(tmp_path):
+    ramp = np.stack(np.meshgrid(np.arange(300) / 299, np.arange(200) / 199), 2)
+    pixels = np.dstack([ramp, np.full((200, 300), 0.4)])
+    camera = Camera(torch.eye(4, dtype=torch.float64), 90.0, 90.0, 70.0, 52.0, 150, 100)
+    views = []
+    for name in ("a.png", "b.png", "gone.png"):
+        views.append(View(name, camera, tmp_path / name, taken_by=name[0]))
+        if name != "gone.png":
+            Image.fromarray((pixels * 255).round().astype(np.uint8)).save(tmp_path / name)
+    at = np.array([[0.25, 0.5], [0.8, 0.3], [0.5, 0.9]])
+    seen = {"a.png": Observations2D(np.array([5, 2, 9]), at), "b.png": Observations2D(np.array([9, 5]), at[:2])}
+    seen["gone.png"] = Observations2D(np.array([5, 2]), at[:2])
+    found = track_colors(views, Observations(np.zeros((12, 3)), np.zeros(12), seen))
+    assert found.photo.tolist() == [0, 0, 0, 1, 1] and found.point.tolist() == [1, 0, 2, 2, 1]
+    assert np.allclose(found.color[:3, :2], at, atol=0.01) and np.allclose(found.color[:, 2], 0.4, atol=0.01)
+    half = np.hypot(150, 100) / 2
+    assert np.allclose(found.place[0], [(0.25 * 150 - 70) / half, (0.5 * 100 - 52) / half])
+    assert rows_of([*views, views[0]]).tolist() == [0, 1, 2, 0]
+    assert Path(views[0].path).exists()

@@ -1,0 +1,126 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from two_blocks import EVERY, STEPS, stop_after
+
+from surfkit.appearance import CameraResponse
+from surfkit.appearance.track_light import TrackColors
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.read import read
+from surfkit.partition import PictureShare, QuantileGrid
+from surfkit.runs import photo_light, pipeline
+from surfkit.runs.blocks.train_blocks import Compute
+from surfkit.runs.folder import Run
+from surfkit.runs.photo_light import LightRecord, light_of
+from surfkit.runs.pipeline import load_run, opened, run
+from surfkit.runs.recipe import Recipe
+from surfkit.scene.srgb import from_linear, linear
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train.stage import Stage
+
+NOTHING = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Photographs of changing exposure, with tracks."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(views=16, width=64, height=48, points=600)), tracks=True)
+    for at, path in enumerate(sorted((folder / "images").iterdir())):
+        light = linear(np.asarray(Image.open(path)) / 255) * 2.0 ** ((-1) ** at * 0.5)
+        Image.fromarray((from_linear(light.clip(0, 1)) * 255).round().astype(np.uint8)).save(path)
+    return Data(folder, test_every=0)
+
+
+@pytest.fixture
+def recipe():
+    return Recipe(pretrain=Stage(steps=STEPS, sh_every=1_000, appearance=CameraResponse()))
+
+
+def test_a_run_finds_exposures_first_and_resumes_with_the_same_bits(data, recipe, tmp_path, monkeypatch):
+    run(recipe, data, tmp_path / "whole", Compute("cpu"), EVERY)
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "optimise", stop_after(pipeline.optimise, 5))
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, data, tmp_path / "halves", Compute("cpu"), EVERY)
+    (tmp_path / "halves/light.json").unlink()  # the numbers are in the checkpoint
+    run(recipe, data, tmp_path / "halves", Compute("cpu"), EVERY)
+    states = [load_run(tmp_path / name)[1] for name in ("whole", "halves")]
+    assert all(torch.equal(value, states[1].points.params[name]) for name, value in states[0].points.params.items())
+    assert torch.equal(states[0].appearances["value"], states[1].appearances["value"])
+
+    record = read_json(tmp_path / "whole/light.json", LightRecord)
+    stops = np.array([record.photographs[view.name].stops for view in read(data).train])
+    off = stops - 0.5 * (-1.0) ** np.arange(len(stops))[:, None]
+    assert np.abs(off - off.mean(0)).max() < 0.15 and np.abs(stops.mean(0)).max() < 1e-9
+    assert list(record.cameras) == ["camera 1"] and record.cameras["camera 1"].curve == (0, 0, 0)
+    value = states[0].appearances["value"]
+    assert torch.allclose(value[:, :3].double(), torch.from_numpy(stops)) and value.shape == (len(stops), 11)
+
+
+def test_blocks_have_the_numbers_of_the_whole_scene(data, recipe, tmp_path):
+    tune = replace(recipe.pretrain, steps=STEPS)
+    recipe = replace(
+        recipe,
+        pretrain=replace(tune, appearance=None),
+        partition=QuantileGrid((2, 1)),
+        assign=PictureShare(),
+        tune=tune,
+    )
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
+    opened_run, scene = opened(tmp_path), read(data)
+    whole = dict(zip([view.name for view in scene.train], light_of(opened_run, scene.train).stops, strict=True))
+    found = 0
+    for folder in sorted((tmp_path / "blocks").glob("0*")):
+        state = checkpoint.load_last(folder / "tune/checkpoint.safetensors")[0]
+        with np.load(folder / "views.npz") as file:
+            names = [name for name in whole if f'"{name}"' in str(file["facts"])]
+        assert torch.equal(state.appearances["value"][:, :3], torch.stack([whole[name] for name in names]))
+        found += 1
+    assert found == 2
+    assert torch.equal(load_run(tmp_path)[1].appearances["value"][:, :3], torch.stack(list(whole.values())))
+
+
+def test_without_tracks_it_is_refused_before_anything_is_written(recipe, tmp_path):
+    write_colmap(tmp_path / "data", photograph(Flight(views=6, width=32, height=24, points=60)))
+    with pytest.raises(BadInput, match="camera-response needs the sparse points .*prepare points.*appearance:exposure"):
+        run(recipe, Data(tmp_path / "data", test_every=0), tmp_path / "run", Compute("cpu"), EVERY)
+    assert not (tmp_path / "run/run.json").exists()
+
+
+def test_numbers_that_are_gone_are_named(data, recipe, tmp_path):
+    run(replace(recipe, pretrain=replace(recipe.pretrain, steps=1)), data, tmp_path, Compute("cpu"), EVERY)
+    scene = read(data)
+    stranger = replace(scene.train[0], name="stranger.png")
+    with pytest.raises(BadInput, match="light.json: it lacks 'stranger.png'; delete it"):
+        light_of(opened(tmp_path), [scene.train[1], stranger])
+
+
+def test_uneven_light_is_told_where_no_stage_learns_it(data, recipe, tmp_path, capsys):
+    short = replace(recipe.pretrain, steps=1, appearance=None)
+    run(replace(recipe, pretrain=short), data, tmp_path / "plain", Compute("cpu"), EVERY)
+    told = capsys.readouterr().err
+    assert "exposures differ by 1.0 stops" in told and "add pretrain.appearance:camera-response" in told
+    run(replace(recipe, pretrain=short), data, tmp_path / "plain", Compute("cpu"), EVERY)
+    assert "exposures differ" not in capsys.readouterr().err, "of a finished run"
+    run(replace(recipe, pretrain=replace(short, appearance=CameraResponse())), data, tmp_path / "with", Compute("cpu"))
+    told = capsys.readouterr().err
+    assert "add pretrain.appearance" not in told and "light of the photographs: exposures differ by 1.0 stops" in told
+
+
+def test_of_many_photographs_some_are_looked_at(data, recipe, monkeypatch):
+    looked = []
+    monkeypatch.setattr(photo_light, "track_colors", lambda views, tracks: looked.append(views) or NOTHING)
+    monkeypatch.setattr(photo_light, "GROUPS", 2)
+    monkeypatch.setattr(photo_light, "GROUP", 3)
+    plain = replace(recipe, pretrain=replace(recipe.pretrain, appearance=None))
+    scene = read(data)
+    photo_light.warn_of_light(Run(data.path / "run", plain, data), scene)
+    names = [view.name for view in scene.train]
+    assert [view.name for view in looked[0]] == [*names[:3], *names[-3:]]
