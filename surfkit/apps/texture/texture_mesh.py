@@ -14,9 +14,9 @@ import numpy as np
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import PaintInput, Pictures
-from surfkit.apps.texture.photo_gains import exposure_gains
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
+from surfkit.apps.texture.radiometry import Radiometry, camera_numbers, estimate
 from surfkit.apps.texture.regions import Region, divide, middles
 from surfkit.apps.texture.resolution import pixel_sizes
 from surfkit.apps.texture.seam_levelling import SeamCorrections, level
@@ -168,7 +168,8 @@ def refuse_unplaced(frame: Frame, geoid: str | None) -> None:
 
 def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
     """What texture.json says of a textured mesh."""
-    mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
+    mesh, atlas, light = made.paint.mesh, made.paint.atlas, made.paint.light
+    corners = light.corners([view.camera for view in subject.views])
     seen, areas = atlas.view != NO_PHOTO, areas_of(mesh.vertices, mesh.faces)
     return {
         "mesh": str(subject.surface.path),
@@ -181,7 +182,8 @@ def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),
         "photographs": len(np.unique(atlas.view[seen])),
         "outliers": made.outliers,
-        "gains": [round(float(gains.min()), 4), round(float(gains.max()), 4)],
+        "gains": [round(float(light.gain.min()), 4), round(float(light.gain.max()), 4)],
+        "corners": [round(float(corners.min()), 4), round(float(corners.max()), 4)],
         "charts": len(atlas.page),
         "pages": [[page.width, page.height] for page in atlas.pages],
         "tiles": int(atlas.tile.max()) + 1,
@@ -224,8 +226,8 @@ def textured(
 
     def choose() -> Arrays:
         longest = settings.size // 2  # so that each chart fits on a page
-        found, gains, outliers = look_at_all(mesh, photos, longest, kept)
-        return {"view": choose_views(found, beyond, edge), "gains": gains, "outliers": np.array([outliers])}
+        found, light, outliers = look_at_all(mesh, photos, longest, kept)
+        return {"view": choose_views(found, light, beyond, edge), "outliers": np.array([outliers]), **vars(light)}
 
     chosen = kept.once("chosen", choose)
     kept.forget(LOOKED_FOLDER)
@@ -233,10 +235,10 @@ def textured(
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
-    gains = chosen["gains"]
-    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))
+    light = Radiometry(chosen["gain"], chosen["vignetting"])
+    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, light)))
     return TexturedMesh(
-        PaintInput(mesh, atlas, photos, gains, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
+        PaintInput(mesh, atlas, photos, light, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
     )
 
 
@@ -328,8 +330,8 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
 
 def look_at_all(
     mesh: Mesh, photos: PrefetchedPhotos, longest: float, kept: TextureCache = TextureCache()
-) -> tuple[Candidates, np.ndarray, int]:
-    """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
+) -> tuple[Candidates, Radiometry, int]:
+    """What can be chosen from, the light of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
     pieces, start = MeshClusters(mesh), 0
     if (before := kept.read(LOOKED_FOLDER)) is not None:
@@ -354,9 +356,9 @@ def look_at_all(
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
-    gains = exposure_gains(found.view, found.color, count)
+    light = estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
     found.shun_clipped()
-    return found, gains, found.refuse_outliers(gains)
+    return found, light, found.refuse_outliers(light)
 
 
 def lay_out(
