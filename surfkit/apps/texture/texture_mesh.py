@@ -197,10 +197,12 @@ def textured(
     kept: TextureCache = TextureCache(),
     finer: Mesh | None = None,
     region: Region | None = None,
+    light: Radiometry | None = None,
 ) -> TexturedMesh:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
-    What is known already can be given: `finer`, the mesh simplified before, and `region`, the regions of the tiles.
+    What is known already can be given: `finer`, the mesh simplified before, `region`, the regions of the tiles, and
+    `light` of the photographs.
     Each step is kept in `kept` when it is finished, and not done again if it is there.
     """
     require_simplification("simplifying a mesh")
@@ -226,8 +228,8 @@ def textured(
 
     def choose() -> Arrays:
         longest = settings.size // 2  # so that each chart fits on a page
-        found, light, outliers = look_at_all(mesh, photos, longest, kept)
-        return {"view": choose_views(found, light, beyond, edge), "outliers": np.array([outliers]), **vars(light)}
+        found, used, outliers = look_at_all(mesh, photos, longest, kept, light)
+        return {"view": choose_views(found, used, beyond, edge), "outliers": np.array([outliers]), **vars(used)}
 
     chosen = kept.once("chosen", choose)
     kept.forget(LOOKED_FOLDER)
@@ -235,10 +237,10 @@ def textured(
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
-    light = Radiometry(chosen["gain"], chosen["vignetting"])
-    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, light)))
+    used = Radiometry(chosen["gain"], chosen["vignetting"])
+    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, used)))
     return TexturedMesh(
-        PaintInput(mesh, atlas, photos, light, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
+        PaintInput(mesh, atlas, photos, used, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
     )
 
 
@@ -263,7 +265,7 @@ def coarser(
         texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
         fewer = max(MIN_LEVEL_TRIANGLES, len(fine.paint.mesh.faces) // 4**level)
         less = replace(settings, texel=texel, triangles=fewer)
-        made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
+        made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth), fine.paint.light)
         mesh = made.paint.mesh
         yield made
 
@@ -329,7 +331,11 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
 
 
 def look_at_all(
-    mesh: Mesh, photos: PrefetchedPhotos, longest: float, kept: TextureCache = TextureCache()
+    mesh: Mesh,
+    photos: PrefetchedPhotos,
+    longest: float,
+    kept: TextureCache = TextureCache(),
+    light: Radiometry | None = None,
 ) -> tuple[Candidates, Radiometry, int]:
     """What can be chosen from, the light of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
@@ -356,7 +362,7 @@ def look_at_all(
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
-    light = estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
+    light = light or estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
     found.shun_clipped()
     return found, light, found.refuse_outliers(light)
 

@@ -377,7 +377,7 @@ def test_the_largest_triangles_that_are_taken_fit_on_a_page(tmp_path):
     longest = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            make, "look_at_all", lambda mesh, photos, most, kept: longest.append(most) or look_at_all(mesh, photos, 1)
+            make, "look_at_all", lambda mesh, photos, most, *_: longest.append(most) or look_at_all(mesh, photos, 1)
         )
         made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",), size=side))
     wide = longest[0]
