@@ -36,6 +36,9 @@ MAX_CACHED_BYTES, PICTURE_PIXEL_BYTES, DEPTH_PIXEL_BYTES = 2 << 30, 6, 4
 round."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
+WHITE_SHARE, MOST_STRETCH = 0.005, 4.0
+"""Grey values of a photograph are stretched so that so large a share of them is white, by this factor at most: noise of
+the windows, and differences within them, are then as large in dark photographs as in bright ones."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
 COARSE_WINDOW_PIXELS, FULL_WINDOW_PIXELS = 16, 32
@@ -75,7 +78,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -269,11 +272,11 @@ class PatchMatchWorkspace:
         return max(0, round(math.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
 
     def read(self, at: int) -> Tensor:
-        """(H, W) uint8, a photograph at full size."""
+        """(H, W) uint8, a photograph at full size, stretched."""
         camera = self.camera(at, 0)
         view = self.given.views[at]
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels).to(torch.float32)
-        return rgb.mean(0).round().to(torch.uint8)
+        return stretched(rgb.mean(0))
 
     def grey(self, at: int, level: int) -> GreyImage:
         """A photograph at a level."""
@@ -380,6 +383,12 @@ class PatchMatchWorkspace:
             window=settings.window,
             survey=False,
         )
+
+
+def stretched(grey: Tensor) -> Tensor:
+    """(H, W) uint8 of (H, W) grey values in [0, 255], times what makes `WHITE_SHARE` of them white."""
+    white = float(np.quantile(grey.numpy(), 1 - WHITE_SHARE))
+    return (grey * min(255 / max(white, 1.0), MOST_STRETCH)).round().clamp(max=255).to(torch.uint8)
 
 
 def parallax_of(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> float:
