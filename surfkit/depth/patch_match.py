@@ -18,10 +18,11 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
-from surfkit.depth.cost_volume import ray_map
+from surfkit.depth.cost_volume import PosedImage, ray_map
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
+from surfkit.depth.photo_light import in_one_light, light_of_tracks
 from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
@@ -228,7 +229,8 @@ class PatchMatchWorkspace:
         self.sweep = InitialPlaneSweep(longest=settings.coarsest)
         self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
         kept, every = self.room(), range(len(pairs))
-        self.small = lru_cache(MAX_CACHED_PICTURES)(lambda at: self.sweep.picture(given, at))
+        self.light = light_of_tracks(given.views, given.observations, self.as_taken)
+        self.small = lru_cache(MAX_CACHED_PICTURES)(self.evened)
         self.value = lru_cache(2 * kept)(self.read)
         self.greys = [
             lru_cache(kept)(partial(self.halved, level)) for level in range(1 + max(map(self.levels, every), default=0))
@@ -271,12 +273,22 @@ class PatchMatchWorkspace:
         camera = self.camera(at, 0)
         return max(0, round(math.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
 
+    def as_taken(self, at: int) -> tuple[Camera, Tensor]:
+        """The camera and (3, H, W) colours in [0, 1] of a photograph at the size of the sweep."""
+        taken = self.sweep.picture(self.given, at)
+        return taken.camera, taken.color
+
+    def evened(self, at: int) -> PosedImage:
+        """A photograph at the size of the sweep, in the light of all."""
+        camera, color = self.as_taken(at)
+        return PosedImage(camera, in_one_light(color, self.light, at, camera))
+
     def read(self, at: int) -> Tensor:
-        """(H, W) uint8, a photograph at full size, stretched."""
+        """(H, W) uint8, a photograph at full size, in the light of all and stretched."""
         camera = self.camera(at, 0)
         view = self.given.views[at]
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels).to(torch.float32)
-        return stretched(rgb.mean(0))
+        return stretched(255 * in_one_light(rgb.mean(0) / 255, self.light, at, camera))
 
     def grey(self, at: int, level: int) -> GreyImage:
         """A photograph at a level."""

@@ -83,7 +83,7 @@ def in_other_light(view: View, light: float, corner: float, folder: Path) -> Vie
         color = linear(np.asarray(photo.convert("RGB")) / 255)
     height, width = color.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
-    square = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width**2 + height**2) / 4)
+    square = ((x - view.camera.cx) ** 2 + (y - view.camera.cy) ** 2) / ((width**2 + height**2) / 4)
     color *= light * ((1 + (corner**-0.5 - 1) * square) ** -2)[..., None]
     path = folder / view.path.name
     Image.fromarray(np.rint(255 * from_linear(color)).astype(np.uint8)).save(path.with_suffix(".png"))
@@ -102,8 +102,7 @@ def test_light_of_the_photographs_hardly_matters(farm, tmp_path):
             depth = truth.exact[scene.train[estimate.at].name].depth.float()
             errors.append((1 / (estimate.inverse * depth) - 1).abs()[depth > 0])
         right.append(float((torch.cat(errors) < 0.02).float().mean()))
-    print("RIGHT", right)
-    assert right[1] > right[0] - 0.02
+    assert right[0] > 0.8 and right[1] > right[0] - 0.04  # as they were taken, 0.16 less
 
 
 def test_photographs_are_stretched_to_white():

@@ -9,9 +9,10 @@ from surfkit.apps.maps.bins import corners_of, sort_faces
 from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
 from surfkit.apps.texture.prefetch_photos import by_photograph
-from surfkit.apps.texture.radiometry import exposed, levelled
+from surfkit.apps.texture.seam_levelling import levelled
 from surfkit.apps.texture.texture_export import TexturedMesh
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
+from surfkit.scene.radiometry import exposed
 from surfkit.scene.scene import Frame
 
 MAX_HEIGHT_OFFSET_CELLS = 3.0

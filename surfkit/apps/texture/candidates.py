@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.apps.texture.radiometry import (
+from surfkit.apps.texture.triangle_visibility import TriangleVisibility
+from surfkit.scene.radiometry import (
     MAX_USABLE_COLOR,
-    NO_PHOTO,
     VIGNETTING_TERMS,
     Radiometry,
     SharedPlaces,
     exposed,
 )
-from surfkit.apps.texture.triangle_visibility import TriangleVisibility
 
+NO_PHOTO = -1
+"""Number of the photograph where there is none."""
 MAX_PHOTOS_PER_TRIANGLE = 8
 """Photographs that are remembered for a triangle: those that show it best."""
 MIN_OUTLIER_DISTANCE, OUTLIER_DISTANCE_MEDIANS = 0.08, 3.0

@@ -15,9 +15,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
-from surfkit.apps.texture.radiometry import Radiometry
 from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
+from surfkit.scene.radiometry import Radiometry
 
 SEAM_COST, SEAM_DIFFERENCE = 2.0, 0.04
 """Cost of an edge between two photographs where colours differ so much, of 1, and in proportion elsewhere; that of a

@@ -12,11 +12,11 @@ from scipy import ndimage
 
 from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
-from surfkit.apps.texture.radiometry import Radiometry, exposed, levelled
-from surfkit.apps.texture.seam_levelling import SeamCorrections
+from surfkit.apps.texture.seam_levelling import SeamCorrections, levelled
 from surfkit.apps.texture.texture_atlas import PATCH_SIDE, Atlas, AtlasPage
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
+from surfkit.scene.radiometry import Radiometry, exposed
 
 Pictures = Literal["jpeg", "png"]
 PAGE_JPEG_QUALITY = 92

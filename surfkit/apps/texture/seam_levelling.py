@@ -15,9 +15,9 @@ from scipy.sparse.linalg import cg
 
 from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
-from surfkit.apps.texture.radiometry import Radiometry, exposed
 from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
+from surfkit.scene.radiometry import Radiometry, exposed
 
 SAMPLES_PER_EDGE = 5
 """Along each edge of a seam."""
@@ -27,6 +27,8 @@ VALUE_WEIGHT = 0.003
 """Weight of the values themselves: far from seams they go back to 0."""
 SEAM_ROBUST_SCALE = 0.1
 """Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
+WHITE_ROOM, DARK_COLOR = 0.2, 0.05
+"""Colours nearer to white, or black, than this are changed less at seams."""
 MAX_CORRECTION = 0.25
 """Largest value that is added."""
 
@@ -82,6 +84,13 @@ def level(
     inner = np.stack([corner[seen], np.roll(corner[seen], -1, axis=1)], axis=2).reshape(-1, 2)
     inner = np.unique(np.sort(inner, axis=1), axis=0)
     return SeamCorrections(corner, _solved(pairs, inner, color, len(known)))
+
+
+def levelled(color: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """(..., 3) uint8 of colours in [0, 1] with what is added to them, less the nearer they are to black or white: there
+    it would clip, and no seam shows."""
+    room = np.minimum(color / DARK_COLOR, (1 - color) / WHITE_ROOM).clip(0, 1)
+    return np.rint(255 * (color + room * added)).clip(0, 255).astype(np.uint8)
 
 
 def _seam_colors(

@@ -16,7 +16,6 @@ from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import PaintInput, Pictures
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
-from surfkit.apps.texture.radiometry import Radiometry, camera_numbers, estimate
 from surfkit.apps.texture.regions import Region, divide, middles
 from surfkit.apps.texture.resolution import pixel_sizes
 from surfkit.apps.texture.seam_levelling import SeamCorrections, level
@@ -39,6 +38,7 @@ from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
+from surfkit.scene.radiometry import Radiometry, camera_numbers, estimate
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d"]

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from surfkit.apps.texture.radiometry import vignetting_terms
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.depths import nearest
 from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
+from surfkit.scene.radiometry import vignetting_terms
 
 HIDDEN_SLACK_PX = 2.0
 """How far a triangle may lie behind the nearest surface and be seen, in sides of a pixel at its depth."""

@@ -19,7 +19,6 @@ from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import paint
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos
-from surfkit.apps.texture.radiometry import Radiometry, estimate
 from surfkit.apps.texture.regions import divide, middles
 from surfkit.apps.texture.texture_atlas import make_atlas, packed, texels_of
 from surfkit.apps.texture.texture_mesh import (
@@ -41,6 +40,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
+from surfkit.scene.radiometry import Radiometry, estimate
 from surfkit.scene.scene import Frame, Mask
 
 needs("fast_simplification")

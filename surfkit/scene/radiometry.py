@@ -39,11 +39,8 @@ MAX_GAIN = 4.0
 """No gain is larger, or smaller than the inverse: two stops."""
 KNEE = float(linear(np.array(0.8)))
 """Light up to here is multiplied by the gain; brighter one comes to white where it is white in the photograph."""
-WHITE_ROOM, DARK_COLOR = 0.2, 0.05
-"""Colours nearer to white, or black, than this are changed less at seams."""
 MEAN_SAMPLES = 16
 """Samples along each side of a picture for the mean of a curve over it."""
-NO_PHOTO = -1
 
 
 @dataclass(frozen=True)
@@ -178,13 +175,6 @@ def exposed(color: np.ndarray, gain: np.ndarray) -> np.ndarray:
     t = ((light - start) / (1 - start)).clip(0, 1)
     beyond = (1 - gain * start) * (mean * t**2 + gain * t * (1 - t)) / (mean + (gain + 1 - 2 * mean) * t * (1 - t))
     return from_linear(np.where(light <= start, gain * light, gain * start + beyond))
-
-
-def levelled(color: np.ndarray, added: np.ndarray) -> np.ndarray:
-    """(..., 3) uint8 of colours in [0, 1] with what is added to them, less the nearer they are to black or white: there
-    it would clip, and no seam shows."""
-    room = np.minimum(color / DARK_COLOR, (1 - color) / WHITE_ROOM).clip(0, 1)
-    return np.rint(255 * (color + room * added)).clip(0, 255).astype(np.uint8)
 
 
 def _powers(camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:

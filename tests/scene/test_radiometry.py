@@ -8,7 +8,10 @@ from needs import needs
 
 from surfkit.apps.texture.candidates import Candidates
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos
-from surfkit.apps.texture.radiometry import (
+from surfkit.apps.texture.seam_levelling import levelled
+from surfkit.apps.texture.texture_mesh import local_mesh, look_at_all
+from surfkit.scene.camera import Camera
+from surfkit.scene.radiometry import (
     KNEE,
     MAX_GAIN,
     VIGNETTING_TERMS,
@@ -16,11 +19,8 @@ from surfkit.apps.texture.radiometry import (
     camera_numbers,
     estimate,
     exposed,
-    levelled,
     vignetting_terms,
 )
-from surfkit.apps.texture.texture_mesh import local_mesh, look_at_all
-from surfkit.scene.camera import Camera
 from surfkit.scene.srgb import from_linear, linear
 
 needs("fast_simplification")
