@@ -18,11 +18,11 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
-from surfkit.depth.cost_volume import PosedImage, ray_map
+from surfkit.depth.cost_volume import ray_map
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
-from surfkit.depth.photo_light import in_one_light, light_of_tracks
+from surfkit.depth.photo_light import evened, in_one_light, light_of_tracks, stretched
 from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
@@ -37,9 +37,6 @@ MAX_CACHED_BYTES, PICTURE_PIXEL_BYTES, DEPTH_PIXEL_BYTES = 2 << 30, 6, 4
 round."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
-WHITE_SHARE, MOST_STRETCH = 0.005, 4.0
-"""Grey values of a photograph are stretched so that so large a share of them is white, by this factor at most: noise of
-the windows, and differences within them, are then as large in dark photographs as in bright ones."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
 COARSE_WINDOW_PIXELS, FULL_WINDOW_PIXELS = 16, 32
@@ -229,8 +226,8 @@ class PatchMatchWorkspace:
         self.sweep = InitialPlaneSweep(longest=settings.coarsest)
         self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
         kept, every = self.room(), range(len(pairs))
-        self.light = light_of_tracks(given.views, given.observations, self.as_taken)
-        self.small = lru_cache(MAX_CACHED_PICTURES)(self.evened)
+        self.light = light_of_tracks(given, lambda at: self.sweep.picture(given, at))
+        self.small = lru_cache(MAX_CACHED_PICTURES)(lambda at: evened(self.sweep.picture(given, at), self.light, at))
         self.value = lru_cache(2 * kept)(self.read)
         self.greys = [
             lru_cache(kept)(partial(self.halved, level)) for level in range(1 + max(map(self.levels, every), default=0))
@@ -272,16 +269,6 @@ class PatchMatchWorkspace:
         """How often a photograph is halved before the planes begin in it: to about twice the size of the sweep."""
         camera = self.camera(at, 0)
         return max(0, round(math.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
-
-    def as_taken(self, at: int) -> tuple[Camera, Tensor]:
-        """The camera and (3, H, W) colours in [0, 1] of a photograph at the size of the sweep."""
-        taken = self.sweep.picture(self.given, at)
-        return taken.camera, taken.color
-
-    def evened(self, at: int) -> PosedImage:
-        """A photograph at the size of the sweep, in the light of all."""
-        camera, color = self.as_taken(at)
-        return PosedImage(camera, in_one_light(color, self.light, at, camera))
 
     def read(self, at: int) -> Tensor:
         """(H, W) uint8, a photograph at full size, in the light of all and stretched."""
@@ -395,12 +382,6 @@ class PatchMatchWorkspace:
             window=settings.window,
             survey=False,
         )
-
-
-def stretched(grey: Tensor) -> Tensor:
-    """(H, W) uint8 of (H, W) grey values in [0, 255], times what makes `WHITE_SHARE` of them white."""
-    white = float(np.quantile(grey.numpy(), 1 - WHITE_SHARE))
-    return (grey * min(255 / max(white, 1.0), MOST_STRETCH)).round().clamp(max=255).to(torch.uint8)
 
 
 def parallax_of(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> float:

@@ -14,7 +14,8 @@ from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, pattern, way
 from surfkit.depth.neighbours import in_turn, neighbours
-from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace, stretched
+from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace
+from surfkit.depth.photo_light import stretched
 from surfkit.depth.plane_map import PlaneMap, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
