@@ -9,6 +9,7 @@ from PIL import Image
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
+from surfkit.scene.srgb import from_linear, linear
 from surfkit.testing.synthetic import Box, GroundPlane
 
 HALF = 6.0
@@ -75,8 +76,8 @@ class Town:
 def town(folder, exposures=None, car=None, crs=None, cell=0.5, move=(0.0, 0.0, 0.0)):
     """The scene with its photographs in a folder.
 
-    exposures: what each photograph is multiplied by; car: number of the photograph with a car; move: of the
-    coordinates of the data set.
+    exposures: what the light of each photograph is multiplied by; car: number of the photograph with a car; move: of
+    the coordinates of the data set.
     """
     frame = Frame(np.array([1.0, 2.0, 0.5]) + move, 0.05, 1.0, crs, shift=tuple(map(float, move)))
     views = []
@@ -85,7 +86,8 @@ def town(folder, exposures=None, car=None, crs=None, cell=0.5, move=(0.0, 0.0, 0
         moved[:3, 3] -= pose[:3, :3] @ move
         camera = Camera(frame.local_pose(moved), 150.0, 151.0, 0.52 * WIDTH, 0.49 * HEIGHT, WIDTH, HEIGHT)
         color = photo_of(pose, camera, at == car)
-        color = color * (1.0 if exposures is None else exposures[at])
+        if exposures is not None:
+            color = from_linear(linear(color) * exposures[at])
         path = folder / f"{at:02d}.png"
         Image.fromarray((color * 255).round().clip(0, 255).astype(np.uint8)).save(path)
         views.append(View(path.name, camera, path))

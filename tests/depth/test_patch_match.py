@@ -1,11 +1,13 @@
 """PatchMatch on a scene of which every depth is known, and its kernel against plain loops in float64."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from needs import needs_native
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.depth import patch_match
@@ -13,12 +15,15 @@ from surfkit.depth.base import DepthInput
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, pattern, way
 from surfkit.depth.neighbours import in_turn, neighbours
 from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace
+from surfkit.depth.photo_light import stretched
 from surfkit.depth.plane_map import PlaneMap, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import observations, read
 from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
+from surfkit.scene.scene import View
+from surfkit.scene.srgb import from_linear, linear
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
@@ -71,6 +76,42 @@ def test_what_is_not_trusted_is_worse(farm, estimates):
             wrong[which].append(error[there & (trusted == which)] > 0.02)
     share = {which: float(torch.cat(parts).float().mean()) for which, parts in wrong.items()}
     assert share[False] > 1.7 * share[True] > 0
+
+
+def in_other_light(view: View, light: float, corner: float, folder: Path) -> View:
+    """The view with a photograph of so much light, and so much of that in its corners."""
+    with Image.open(view.path) as photo:
+        color = linear(np.asarray(photo.convert("RGB")) / 255)
+    height, width = color.shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    square = ((x - view.camera.cx) ** 2 + (y - view.camera.cy) ** 2) / ((width**2 + height**2) / 4)
+    color *= light * ((1 + (corner**-0.5 - 1) * square) ** -2)[..., None]
+    path = folder / view.path.name
+    Image.fromarray(np.rint(255 * from_linear(color)).astype(np.uint8)).save(path.with_suffix(".png"))
+    return replace(view, path=path.with_suffix(".png"))
+
+
+def test_light_of_the_photographs_hardly_matters(farm, tmp_path):
+    """Every other one has a quarter of the light, and all have corners of half of it."""
+    scene, tracks, truth = farm
+    dark = [in_other_light(view, 0.25 if at % 2 else 1, 0.5, tmp_path) for at, view in enumerate(scene.train)]
+    right = []
+    for number, views in enumerate((scene.train, dark)):
+        given = DepthInput(views, tracks, CPU, tmp_path / str(number))
+        errors = []
+        for estimate in PatchMatch(coarsest=60).estimate(given, [5, 6, 7, 12]):
+            depth = truth.exact[scene.train[estimate.at].name].depth.float()
+            errors.append((1 / (estimate.inverse * depth) - 1).abs()[depth > 0])
+        right.append(float((torch.cat(errors) < 0.02).float().mean()))
+    assert right[0] > 0.8 and right[1] > right[0] - 0.04  # as they were taken, 0.16 less
+
+
+def test_photographs_are_stretched_to_white():
+    grey = torch.linspace(0, 100, 1001)[None]
+    found = stretched(grey)
+    wanted = (grey * 255 / 99.5).clamp(max=255)
+    assert (found - wanted).abs().max() <= 0.5 + 1e-3 and (found == 255).float().mean() < 0.01
+    assert stretched(grey / 100).max() == 4 and stretched(0 * grey).max() == 0, "noise stays dark"
 
 
 def two_pictures(seed: int) -> tuple[GreyImage, GreyImage]:

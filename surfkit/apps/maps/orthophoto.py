@@ -8,10 +8,11 @@ import torch
 from surfkit.apps.maps.bins import corners_of, sort_faces
 from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
-from surfkit.apps.texture.photo_gains import exposed, levelled
 from surfkit.apps.texture.prefetch_photos import by_photograph
+from surfkit.apps.texture.seam_levelling import levelled
 from surfkit.apps.texture.texture_export import TexturedMesh
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
+from surfkit.scene.radiometry import exposed
 from surfkit.scene.scene import Frame
 
 MAX_HEIGHT_OFFSET_CELLS = 3.0
@@ -72,7 +73,8 @@ class OrthophotoColors:
         places = (paint.mesh.vertices[paint.mesh.faces[face]].astype(np.float64) * shares[:, :, None]).sum(1)
         x, y, _ = paint.photos.views[number].camera.project(torch.from_numpy(places)).numpy().T
         added = (paint.levels.value[paint.levels.corner[face]] * shares[:, :, None]).sum(1)
-        return levelled(exposed(between(paint.photos(number), x, y) / 255, paint.gains[number]), added)
+        gain = paint.light.gains_at(number, paint.photos.views[number].camera, x, y)
+        return levelled(exposed(between(paint.photos(number), x, y) / 255, gain), added)
 
 
 def between(photo: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.apps.texture.photo_gains import MAX_USABLE_COLOR, NO_PHOTO, exposed
 from surfkit.apps.texture.triangle_visibility import TriangleVisibility
+from surfkit.scene.radiometry import (
+    MAX_USABLE_COLOR,
+    VIGNETTING_TERMS,
+    Radiometry,
+    SharedPlaces,
+    exposed,
+)
 
+NO_PHOTO = -1
+"""Number of the photograph where there is none."""
 MAX_PHOTOS_PER_TRIANGLE = 8
 """Photographs that are remembered for a triangle: those that show it best."""
 MIN_OUTLIER_DISTANCE, OUTLIER_DISTANCE_MEDIANS = 0.08, 3.0
 """A colour that is further from the median of all photographs than this, and than so many times the median distance,
 shows something else, such as a car that has moved."""
+MAX_SHARED_PLACES = 300_000
+"""Triangles that the light of photographs is found from, of a larger mesh."""
 CLIPPED_QUALITY = 0.1
 """What the quality of a photograph of a triangle is multiplied by that shows it white: others may show its colour."""
+
+BATCH_TRIANGLES = 1 << 18
+"""Triangles at once."""
 
 
 class Candidates:
@@ -23,12 +36,14 @@ class Candidates:
         view: (F, MOST) int32 number of the photograph; NONE where there is none.
         quality: (F, MOST) float32, 0 where there is none.
         color: (F, MOST, 3) uint8 mean colour of the triangle in it.
+        terms: (F, MOST, T) float16 where in it the triangle lies, see `vignetting_terms`.
     """
 
     def __init__(self, count: int) -> None:
         self.view = np.full((count, MAX_PHOTOS_PER_TRIANGLE), NO_PHOTO, np.int32)
         self.quality = np.zeros((count, MAX_PHOTOS_PER_TRIANGLE), np.float32)
         self.color = np.zeros((count, MAX_PHOTOS_PER_TRIANGLE, 3), np.uint8)
+        self.terms = np.zeros((count, MAX_PHOTOS_PER_TRIANGLE, VIGNETTING_TERMS), np.float16)
 
     def offer(self, view: int, sight: TriangleVisibility) -> None:
         """Take what a photograph shows, where it is better than the worst that is known."""
@@ -38,25 +53,32 @@ class Candidates:
         self.view[rows, slots] = view
         self.quality[rows, slots] = sight.quality[better]
         self.color[rows, slots] = sight.color[better]
+        self.terms[rows, slots] = sight.terms[better]
+
+    def shared(self) -> SharedPlaces:
+        """Places as photographs show them: the triangles, evenly spread ones of more than `MAX_SHARED_PLACES`."""
+        some = np.arange(0, len(self.view), -(-len(self.view) // MAX_SHARED_PLACES) or 1)
+        row, slot = np.nonzero(self.view[some] != NO_PHOTO)
+        at = some[row], slot
+        return SharedPlaces(some[row], self.view[at], self.color[at], self.terms[at])
 
     def shun_clipped(self) -> None:
         """Let photographs in which a triangle is white count less."""
         self.quality[(self.color > MAX_USABLE_COLOR).any(2)] *= np.float32(CLIPPED_QUALITY)
 
-    def refuse_outliers(self, gains: np.ndarray) -> int:
+    def refuse_outliers(self, light: Radiometry) -> int:
         """Forget photographs of a triangle in which it has another colour than in most; how many.
 
         Two photographs that differ say nothing about which of them is right.
 
         Args:
-            gains: (V, 3) what the colours of each photograph are multiplied by.
+            light: What that of each photograph is multiplied by.
         """
         refused = 0
-        for at in range(0, len(self.view), 1 << 18):
-            part = slice(at, at + (1 << 18))
+        for at in range(0, len(self.view), BATCH_TRIANGLES):
+            part = slice(at, at + BATCH_TRIANGLES)
             there = self.view[part] != NO_PHOTO
-            color = exposed(self.color[part] / np.float32(255), gains[self.view[part]].astype(np.float32))
-            color[~there] = np.nan
+            color = self._colors(part, light)
             rows = np.flatnonzero(there.sum(1) >= 3)
             away = np.abs(color[rows] - np.nanmedian(color[rows], axis=1, keepdims=True)).max(2)
             limit = np.maximum(
@@ -67,3 +89,21 @@ class Candidates:
             self.quality[rows[row] + at, slot] = 0
             refused += len(row)
         return refused
+
+    def differences(self, light: Radiometry) -> np.ndarray:
+        """(F,) float32 mean difference of the colours of a triangle in its photographs from their median, of 1."""
+        found = np.zeros(len(self.view), np.float32)
+        for at in range(0, len(self.view), BATCH_TRIANGLES):
+            part = slice(at, at + BATCH_TRIANGLES)
+            color = self._colors(part, light)
+            rows = np.flatnonzero((self.view[part] != NO_PHOTO).sum(1) >= 2)
+            away = np.abs(color[rows] - np.nanmedian(color[rows], axis=1, keepdims=True))
+            found[rows + at] = np.nanmean(away, axis=(1, 2))
+        return found
+
+    def _colors(self, part: slice, light: Radiometry) -> np.ndarray:
+        """(n, MOST, 3) colours in [0, 1] of some triangles, made alike; NaN where there is no photograph."""
+        gain = light.at_terms(self.view[part], self.terms[part].astype(np.float32))
+        color = exposed(self.color[part] / np.float32(255), gain)
+        color[self.view[part] == NO_PHOTO] = np.nan
+        return color

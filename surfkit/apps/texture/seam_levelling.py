@@ -14,10 +14,10 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
 from surfkit.apps.texture.candidates import NO_PHOTO
-from surfkit.apps.texture.photo_gains import exposed
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
 from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
+from surfkit.scene.radiometry import Radiometry, exposed
 
 SAMPLES_PER_EDGE = 5
 """Along each edge of a seam."""
@@ -27,6 +27,8 @@ VALUE_WEIGHT = 0.003
 """Weight of the values themselves: far from seams they go back to 0."""
 SEAM_ROBUST_SCALE = 0.1
 """Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
+WHITE_ROOM, DARK_COLOR = 0.2, 0.05
+"""Colours nearer to white, or black, than this are changed less at seams."""
 MAX_CORRECTION = 0.25
 """Largest value that is added."""
 
@@ -50,7 +52,7 @@ def level(
     places: np.ndarray,
     beyond: np.ndarray,
     photos: PrefetchedPhotos,
-    gains: np.ndarray,
+    light: Radiometry,
 ) -> SeamCorrections:
     """Find the values.
 
@@ -60,10 +62,10 @@ def level(
         places: (F, 3, 2) corners in the photograph.
         beyond: (F, 3) triangles beyond the edges.
         photos: The photographs.
-        gains: (V, 3) what their colours are multiplied by.
+        light: What theirs is multiplied by.
     """
     seen = np.flatnonzero(view != NO_PHOTO)
-    count = len(gains)
+    count = len(photos.views)
     known, inverse = np.unique(faces[seen].astype(np.int64) * count + view[seen, None], return_inverse=True)
     corner = np.zeros(faces.shape, np.int64)
     corner[seen] = inverse.reshape(-1, 3)
@@ -73,7 +75,7 @@ def level(
     )
     if not len(face):
         return SeamCorrections(corner, np.zeros((len(known), 3), np.float32))
-    color = _seam_colors(corner, view, places, (face, edge), photos, gains, len(known))
+    color = _seam_colors(corner, view, places, (face, edge), photos, light, len(known))
     ends = np.stack([corner[face, edge], corner[face, (edge + 1) % 3]], axis=1)
     # the same two vertices, of the part beyond
     vertices = np.stack([faces[face, edge], faces[face, (edge + 1) % 3]], axis=1).astype(np.int64)
@@ -84,13 +86,20 @@ def level(
     return SeamCorrections(corner, _solved(pairs, inner, color, len(known)))
 
 
+def levelled(color: np.ndarray, added: np.ndarray) -> np.ndarray:
+    """(..., 3) uint8 of colours in [0, 1] with what is added to them, less the nearer they are to black or white: there
+    it would clip, and no seam shows."""
+    room = np.minimum(color / DARK_COLOR, (1 - color) / WHITE_ROOM).clip(0, 1)
+    return np.rint(255 * (color + room * added)).clip(0, 255).astype(np.uint8)
+
+
 def _seam_colors(
     corner: np.ndarray,
     view: np.ndarray,
     places: np.ndarray,
     seam: tuple[np.ndarray, np.ndarray],
     photos: PrefetchedPhotos,
-    gains: np.ndarray,
+    light: Radiometry,
     count: int,
 ) -> np.ndarray:
     """(n, 3) float64 mean colours of photographs at the vertices of seams, along the seams; elsewhere 0."""
@@ -104,7 +113,8 @@ def _seam_colors(
         for share in (np.arange(SAMPLES_PER_EDGE) + 0.5) / SAMPLES_PER_EDGE:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)
             x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
-            shown = exposed(picture[:, y, x].T / 255, gains[number])
+            gain = light.gains_at(number, photos.views[number].camera, x + 0.5, y + 0.5)
+            shown = exposed(picture[:, y, x].T / 255, gain)
             for at, weight in ((corner[f, e], 1 - share), (corner[f, (e + 1) % 3], share)):
                 np.add.at(sums, at, weight * shown)
                 np.add.at(weights, at, weight)

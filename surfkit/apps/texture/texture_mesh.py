@@ -14,7 +14,6 @@ import numpy as np
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import PaintInput, Pictures
-from surfkit.apps.texture.photo_gains import exposure_gains
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
 from surfkit.apps.texture.regions import Region, divide, middles
@@ -39,6 +38,7 @@ from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
+from surfkit.scene.radiometry import Radiometry, camera_numbers, estimate
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d"]
@@ -168,7 +168,8 @@ def refuse_unplaced(frame: Frame, geoid: str | None) -> None:
 
 def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
     """What texture.json says of a textured mesh."""
-    mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
+    mesh, atlas, light = made.paint.mesh, made.paint.atlas, made.paint.light
+    corners = light.corners([view.camera for view in subject.views])
     seen, areas = atlas.view != NO_PHOTO, areas_of(mesh.vertices, mesh.faces)
     return {
         "mesh": str(subject.surface.path),
@@ -181,7 +182,8 @@ def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),
         "photographs": len(np.unique(atlas.view[seen])),
         "outliers": made.outliers,
-        "gains": [round(float(gains.min()), 4), round(float(gains.max()), 4)],
+        "gains": [round(float(light.gain.min()), 4), round(float(light.gain.max()), 4)],
+        "corners": [round(float(corners.min()), 4), round(float(corners.max()), 4)],
         "charts": len(atlas.page),
         "pages": [[page.width, page.height] for page in atlas.pages],
         "tiles": int(atlas.tile.max()) + 1,
@@ -195,10 +197,12 @@ def textured(
     kept: TextureCache = TextureCache(),
     finer: Mesh | None = None,
     region: Region | None = None,
+    light: Radiometry | None = None,
 ) -> TexturedMesh:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
-    What is known already can be given: `finer`, the mesh simplified before, and `region`, the regions of the tiles.
+    What is known already can be given: `finer`, the mesh simplified before, `region`, the regions of the tiles, and
+    `light` of the photographs.
     Each step is kept in `kept` when it is finished, and not done again if it is there.
     """
     require_simplification("simplifying a mesh")
@@ -224,8 +228,8 @@ def textured(
 
     def choose() -> Arrays:
         longest = settings.size // 2  # so that each chart fits on a page
-        found, gains, outliers = look_at_all(mesh, photos, longest, kept)
-        return {"view": choose_views(found, beyond, edge), "gains": gains, "outliers": np.array([outliers])}
+        found, used, outliers = look_at_all(mesh, photos, longest, kept, light)
+        return {"view": choose_views(found, used, beyond, edge), "outliers": np.array([outliers]), **vars(used)}
 
     chosen = kept.once("chosen", choose)
     kept.forget(LOOKED_FOLDER)
@@ -233,10 +237,10 @@ def textured(
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
-    gains = chosen["gains"]
-    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))
+    used = Radiometry(chosen["gain"], chosen["vignetting"])
+    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, used)))
     return TexturedMesh(
-        PaintInput(mesh, atlas, photos, gains, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
+        PaintInput(mesh, atlas, photos, used, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
     )
 
 
@@ -261,7 +265,7 @@ def coarser(
         texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
         fewer = max(MIN_LEVEL_TRIANGLES, len(fine.paint.mesh.faces) // 4**level)
         less = replace(settings, texel=texel, triangles=fewer)
-        made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
+        made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth), fine.paint.light)
         mesh = made.paint.mesh
         yield made
 
@@ -327,9 +331,13 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
 
 
 def look_at_all(
-    mesh: Mesh, photos: PrefetchedPhotos, longest: float, kept: TextureCache = TextureCache()
-) -> tuple[Candidates, np.ndarray, int]:
-    """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
+    mesh: Mesh,
+    photos: PrefetchedPhotos,
+    longest: float,
+    kept: TextureCache = TextureCache(),
+    light: Radiometry | None = None,
+) -> tuple[Candidates, Radiometry, int]:
+    """What can be chosen from, the light of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
     pieces, start = MeshClusters(mesh), 0
     if (before := kept.read(LOOKED_FOLDER)) is not None:
@@ -354,9 +362,9 @@ def look_at_all(
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
-    gains = exposure_gains(found.view, found.color, count)
+    light = light or estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
     found.shun_clipped()
-    return found, gains, found.refuse_outliers(gains)
+    return found, light, found.refuse_outliers(light)
 
 
 def lay_out(

@@ -11,14 +11,12 @@ from needs import needs, needs_native
 from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
-from surfkit.apps.texture import photo_gains as exposure
-from surfkit.apps.texture import pieces
+from surfkit.apps.texture import candidates, pieces
 from surfkit.apps.texture import seam_levelling as leveling
 from surfkit.apps.texture import texture_mesh as make
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import paint
-from surfkit.apps.texture.photo_gains import exposure_gains
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos
 from surfkit.apps.texture.regions import divide, middles
@@ -42,6 +40,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
+from surfkit.scene.radiometry import Radiometry, estimate
 from surfkit.scene.scene import Frame, Mask
 
 needs("fast_simplification")
@@ -158,7 +157,7 @@ def test_a_car_in_every_photograph_would_be_there(tmp_path):
     assert yellow.sum() > 4 and (found.view[yellow] == 3).all()
     before = yellow & (found.quality == found.quality.max(1, keepdims=True))
     assert before.any(), "it is the best photograph of some triangles"
-    found.refuse_outliers(np.ones((len(scene.views), 3)))
+    found.refuse_outliers(Radiometry.unchanged(len(scene.views)))
     assert not (found.view[yellow] == 3).any()
     assert (found.view != NO_PHOTO).any(1).mean() > 0.85, "others are left"
 
@@ -259,11 +258,11 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures)
     mesh, photos = local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8)
-    found, gains, _ = look_at_all(mesh, photos, 1000)
-    wanted = np.median(exposures) / exposures
-    assert np.abs(gains / wanted[:, None] - 1).max() < 0.02
+    found, light, _ = look_at_all(mesh, photos, 1000)
+    wanted = np.exp(np.log(exposures).mean()) / exposures
+    assert np.abs(light.gain / wanted[:, None] - 1).max() < 0.04
     beyond, edge = neighbours(mesh.faces)
-    atlas, _ = lay_out(mesh, scene.views, choose_views(found, beyond, edge), beyond, 1024)
+    atlas, _ = lay_out(mesh, scene.views, choose_views(found, light, beyond, edge), beyond, 1024)
     steps = {}
     solved = leveling._solved
 
@@ -277,9 +276,9 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(leveling, "_solved", kept)
         arguments = mesh.faces, atlas.view, atlas.places, beyond, photos
-        leveling.level(*arguments, gains)
+        leveling.level(*arguments, light)
         fitted = dict(steps)
-        small = 1 + 0.25 * (gains - 1)  # what levelling alone can do, where gains are wrong
+        small = replace(light, gain=light.gain**0.25)  # what levelling alone can do, where gains are wrong
         leveling.level(*arguments, small)
     assert fitted["before"] < 0.5 * steps["before"]
     assert fitted["after"] <= fitted["before"] and steps["after"] < 0.6 * steps["before"]
@@ -378,7 +377,7 @@ def test_the_largest_triangles_that_are_taken_fit_on_a_page(tmp_path):
     longest = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            make, "look_at_all", lambda mesh, photos, most, kept: longest.append(most) or look_at_all(mesh, photos, 1)
+            make, "look_at_all", lambda mesh, photos, most, *_: longest.append(most) or look_at_all(mesh, photos, 1)
         )
         made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",), size=side))
     wide = longest[0]
@@ -397,17 +396,25 @@ def test_neighbours_get_the_same_photograph():
     """A strip of triangles that two photographs show about as well, in turns: one of the two is chosen for all."""
     places, faces = sheet((0, 0, 0), np.array([40.0, 0, 0]), np.array([0, 1.0, 0]), 1.0)
     found = Candidates(len(faces))
-    draw = np.random.default_rng(4).uniform(0.9, 1.0, (len(faces), 2))
+    draw, light = np.random.default_rng(4).uniform(0.9, 1.0, (len(faces), 2)), Radiometry.unchanged(8)
+    found.color[:] = 120
+    found.color[:, 1] = 190
     found.view[:, :2], found.quality[:, :2] = [5, 7], draw
     beyond, edge = neighbours(faces)
-    assert len(np.unique(choose_views(found, beyond, edge))) == 1
+    assert len(np.unique(choose_views(found, light, beyond, edge))) == 1
     left = places[faces].mean(1)[:, 0] < 20
     found.quality[:, 0] = np.where(left, 1.0, 0.05)
     found.quality[:, 1] = np.where(left, 0.05, 1.0)
-    assert (choose_views(found, beyond, edge) == np.where(left, 5, 7)).all()
+    assert (choose_views(found, light, beyond, edge) == np.where(left, 5, 7)).all()
+    x = places[faces].mean(1)[:, 0]
+    found.quality[:, :2] = np.where(x[:, None] > 28, [0.01, 1.0], [1.0, 0.9])
+    found.color[(x > 23) & (x < 25), 1] = 120
+    order = np.argsort(x)
+    cut = x[order][np.flatnonzero(np.diff(choose_views(found, light, beyond, edge)[order]))]
+    assert ((cut > 23) & (cut < 25)).all() and len(cut), "where both have the same colour"
     found.view[3] = NO_PHOTO
     found.quality[3] = 0
-    assert np.flatnonzero(choose_views(found, beyond, edge) == NO_PHOTO).tolist() == [3]
+    assert np.flatnonzero(choose_views(found, light, beyond, edge) == NO_PHOTO).tolist() == [3]
 
 
 def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
@@ -418,7 +425,7 @@ def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
     monkeypatch.setattr(pieces, "MAX_PIECE_TRIANGLES", 50)
     parts = look_at_all(mesh, photos, 1000)
     assert (whole[0].view == parts[0].view).all() and (whole[0].quality == parts[0].quality).all()
-    assert (whole[0].color == parts[0].color).all() and (whole[1] == parts[1]).all()
+    assert (whole[0].color == parts[0].color).all() and (whole[1].gain == parts[1].gain).all()
     strip, faces = sheet((-100, -1, 0), np.array([200.0, 0, 0]), np.array([0, 2.0, 0]), 0.5)
     divided = MeshClusters(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
     for x in (-150.0, -99.0, 0.0, 60.0):
@@ -433,10 +440,10 @@ def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
 def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures, cell=0.25)
-    found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8), 1000)
-    monkeypatch.setattr(exposure, "MAX_SAMPLED_TRIANGLES", len(found.view) // 3)
-    some = exposure_gains(found.view, found.color, 12)
-    assert not np.array_equal(some, gains) and np.abs(some / gains - 1).max() < 0.02
+    found, light, _ = look_at_all(local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8), 1000)
+    monkeypatch.setattr(candidates, "MAX_SHARED_PLACES", len(found.view) // 3)
+    some = estimate(found.shared(), np.zeros(12, np.int64)).gain
+    assert not np.array_equal(some, light.gain) and np.abs(some / light.gain - 1).max() < 0.04
 
 
 def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch):
@@ -456,7 +463,7 @@ def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch)
 def test_gains_of_photographs_that_share_nothing_stay_one():
     found = Candidates(100)
     found.view[:50, 0], found.view[50:, 0], found.color[:] = 0, 1, 128
-    assert np.allclose(exposure_gains(found.view, found.color, 3), 1)
+    assert np.allclose(estimate(found.shared(), np.zeros(3, np.int64)).gain, 1)
 
 
 def test_regions_weigh_no_more_than_asked():
