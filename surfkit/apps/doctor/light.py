@@ -30,8 +30,8 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
         xyz: (S, 3) the points, input frame.
         recipe: To train by.
     """
-    looks = {name: look for name, look in known.items() if look.colors is not None and not look.flat}
-    shots = [shot for shot in gathered.capture.shots if shot.name in looks]
+    colors = {name: look.colors for name, look in known.items() if look.colors is not None and not look.flat}
+    shots = [shot for shot in gathered.capture.shots if shot.name in colors]
     if len(shots) < MIN_PHOTOGRAPHS or not recipe.without_appearance:
         return []
     parts = []
@@ -41,11 +41,11 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
         size = np.array([camera.width, camera.height])
         middle = np.array([camera.principal_point_x, camera.principal_point_y])
         place = (share[rows] * size - middle) * 2 / np.hypot(*size)
-        parts.append((np.full(len(rows), at), rows, place, looks[shot.name].colors[rows]))
+        parts.append((np.full(len(rows), at), rows, place, colors[shot.name][rows]))
     names = cameras_of(shots)
     cameras = {name: row for row, name in enumerate(dict.fromkeys(names))}
-    colors = TrackColors(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    light = fit_light(colors, np.array([cameras[name] for name in names]))
+    tracks = TrackColors(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    light = fit_light(tracks, np.array([cameras[name] for name in names]))
     spread = LightSpread.of(light)
     if not spread.is_uneven:
         return []
