@@ -69,8 +69,9 @@ class PatchMatch(DepthEstimator):
 
     Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency,
     in the views that match best at each pixel; then also by the reprojection error in the depth maps of other
-    views (Xu and Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit; on a GPU,
-    planes are tried there.
+    views (Xu and Tao 2019). Before, exposure, white balance and vignetting of the photographs are evened out by the
+    sparse points that they share. The time is linear in the number of pixels. Needs the compiled part of surfkit; on a
+    GPU, planes are tried there.
     """
 
     aligned: ClassVar[bool] = True
