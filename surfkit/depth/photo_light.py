@@ -12,7 +12,14 @@ from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthInput
 from surfkit.depth.cost_volume import PosedImage
 from surfkit.scene.camera import Camera
-from surfkit.scene.radiometry import Radiometry, SharedPlaces, camera_numbers, estimate, vignetting_terms
+from surfkit.scene.radiometry import (
+    MAX_SHARED_PLACES,
+    Radiometry,
+    SharedPlaces,
+    camera_numbers,
+    estimate,
+    vignetting_terms,
+)
 from surfkit.scene.srgb import from_linear, linear
 
 LIGHT_PHASE = "comparing the light of photographs"
@@ -28,19 +35,19 @@ def light_of_tracks(given: DepthInput, picture: Callable[[int], PosedImage]) -> 
         given: The photographs, and where they show points.
         picture: Gives a photograph at any size.
     """
-    parts = []
+    parts, step = [], -(-len(given.observations.xyz) // MAX_SHARED_PLACES)
     for number, view in enumerate(given.views):
         seen = given.observations.seen.get(view.name)
         if seen is None or not len(seen.points):
             continue
-        inside = ((seen.at >= 0) & (seen.at < 1)).all(1)
+        used = ((seen.at >= 0) & (seen.at < 1)).all(1) & (seen.points % step == 0)
         taken = picture(number)
         camera = taken.camera
-        x, y = (seen.at[inside] * [camera.width, camera.height]).T
+        x, y = (seen.at[used] * [camera.width, camera.height]).T
         values = taken.color.cpu().numpy()[:, y.astype(np.int64), x.astype(np.int64)].T
         photo = np.full(len(x), number)
         emit(Progress(LIGHT_PHASE, number + 1, len(given.views)))
-        parts.append((seen.points[inside], photo, np.rint(255 * values), vignetting_terms(camera, x, y)))
+        parts.append((seen.points[used], photo, np.rint(255 * values), vignetting_terms(camera, x, y)))
     if not parts:
         return Radiometry.unchanged(len(given.views))
     place, photo, values, terms = (np.concatenate(each) for each in zip(*parts, strict=True))

@@ -20,6 +20,8 @@ from surfkit.scene.srgb import from_linear, linear
 
 MIN_SHARED_PLACES = 30
 """Places that two photographs must both show to be tied to one another."""
+MAX_SHARED_PLACES = 300_000
+"""Places that the light of photographs is found from, where there are more."""
 MIN_USABLE_COLOR, MAX_USABLE_COLOR = 8, 247
 """Colours beyond these tell nothing of the light."""
 VIGNETTING_TERMS = 2

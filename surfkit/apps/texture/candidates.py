@@ -6,6 +6,7 @@ import numpy as np
 
 from surfkit.apps.texture.triangle_visibility import TriangleVisibility
 from surfkit.scene.radiometry import (
+    MAX_SHARED_PLACES,
     MAX_USABLE_COLOR,
     VIGNETTING_TERMS,
     Radiometry,
@@ -20,8 +21,6 @@ MAX_PHOTOS_PER_TRIANGLE = 8
 MIN_OUTLIER_DISTANCE, OUTLIER_DISTANCE_MEDIANS = 0.08, 3.0
 """A colour that is further from the median of all photographs than this, and than so many times the median distance,
 shows something else, such as a car that has moved."""
-MAX_SHARED_PLACES = 300_000
-"""Triangles that the light of photographs is found from, of a larger mesh."""
 CLIPPED_QUALITY = 0.1
 """What the quality of a photograph of a triangle is multiplied by that shows it white: others may show its colour."""
 
