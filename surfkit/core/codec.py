@@ -176,7 +176,10 @@ def _load_component(base: type[Component], data: Any, at: str) -> Any:
 
 
 def _load_dataclass(cls: type, data: Any, at: str) -> Any:
+    """A dataclass; one whose settings have changed has a class method `upgraded`: today's JSON from that of before."""
     _require(dict, data, at)
+    if upgraded := getattr(cls, "upgraded", None):
+        data = upgraded(data)
     known = {field.name: field for field in fields(cls) if field.init}
     if wrong := [key for key in data if key not in known]:
         raise BadInput(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
@@ -69,6 +70,14 @@ class Stage:
             raise BadInput(f"sh_every is {self.sh_every}; it must be 1 or more steps")
         if unknown := set(self.signal.terms or ()) - set(self.losses):
             raise BadInput(f"signal.terms names {', '.join(sorted(unknown))}; the losses are {', '.join(self.losses)}")
+
+    @classmethod
+    def upgraded(cls, data: Mapping[str, Any]) -> dict[str, Any]:
+        """The JSON of a stage, also of one from when it had `update` in place of an optimizer."""
+        found = dict(data)
+        if (update := found.pop("update", None)) is not None and "optimizer" not in found:
+            found["optimizer"] = {"use": "adam-in-view" if update == "in-view" else "adam"}
+        return found
 
     def weights_at(self, index: int) -> dict[str, float]:
         """Weights of the losses that count in step `index` of 1..`steps`, by key."""

@@ -6,6 +6,7 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, load
 from surfkit.core.events import PhotoSkipped
 from surfkit.core.schedule import LearningRate
 from surfkit.densify import ADC, AbsGradient, LossGradient, Trim
@@ -18,6 +19,7 @@ from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.edit import Edit
 from surfkit.raster.psnr import psnr
+from surfkit.train.adam import Adam, AdamInView
 from surfkit.train.faults import Diverged
 from surfkit.train.stage import Stage
 
@@ -356,3 +358,15 @@ def test_a_view_that_sees_nothing_changes_no_colour_and_gives_no_signal(begin):
     trimmed = replace(trainer, stage=replace(stage, prune=(Trim(),)))
     with pytest.raises(BadInput, match="step 1 would drop every point"):  # unseen by all views, all of them
         trimmed.step(trimmed.begin(state.points, torch.Generator()))
+
+
+@pytest.mark.parametrize(("update", "optimizer"), [("in-view", AdamInView()), ("all", Adam())])
+def test_stages_of_before_there_were_optimizers_are_read(update, optimizer):
+    written = {**dump(Stage(steps=7)), "update": update}
+    del written["optimizer"]
+    assert load(Stage, written) == Stage(steps=7, optimizer=optimizer)
+
+
+def test_unknown_settings_are_refused_still():
+    with pytest.raises(BadInput, match="updates: unknown setting"):
+        load(Stage, {**dump(Stage()), "updates": "all"})
