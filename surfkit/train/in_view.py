@@ -48,8 +48,8 @@ class PointsInView:
         if some is None:
             rows = true_rows(rasterizer.in_view(primitive.activate(params, 0), camera, near))
         else:
-            near_by = {name: value.index_select(0, some) for name, value in params.items()}
-            rows = some[true_rows(rasterizer.in_view(primitive.activate(near_by, 0), camera, near))]
+            near_by = primitive.activate(without_harmonics(params, some), 0)
+            rows = some[true_rows(rasterizer.in_view(near_by, camera, near))]
         return cls(rows, len(params["means"]))
 
     @classmethod
@@ -71,6 +71,15 @@ class PointsInView:
         """(N, ...) of (R, ...), 0 for the points that are not in view."""
         found = values.new_zeros(self.count, *values.shape[1:])
         return found.index_copy_(0, self.rows, values)
+
+
+def without_harmonics(columns: Columns, rows: Tensor) -> Columns:
+    """(R, ...) of each of (N, ...), to see where splats are: of the harmonics beyond the first, three quarters of a
+    point, those of one point stand for all."""
+    return {
+        name: value[:1].expand(len(rows), *value.shape[1:]) if name == "sh_rest" else value.index_select(0, rows)
+        for name, value in columns.items()
+    }
 
 
 def current_blocks(setup: StageSetup, state: StageState) -> PointBlocks:
@@ -126,7 +135,7 @@ def why_all(stage: Stage, primitive: Primitive) -> str | None:
 def note_moved(setup: StageSetup, state: StageState, in_view: PointsInView) -> None:
     """Widen the bounds of blocks by their points in view, which have been updated."""
     if state.blocks is not None:
-        moved = setup.primitive.activate(in_view.of_columns(state.points.params), 0)
+        moved = setup.primitive.activate(without_harmonics(state.points.params, in_view.rows), 0)
         state.blocks.widen(in_view.rows, moved)
 
 
