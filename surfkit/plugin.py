@@ -5,7 +5,7 @@ One name, one import: `from surfkit.plugin import Loss, Target, hookimpl`. `surf
 
 from __future__ import annotations
 
-from surfkit.appearance.base import Appearance
+from surfkit.appearance.base import Appearance, PhotoLight
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, Find, MatchInput
 from surfkit.compress.base import Compressor, Plan
 from surfkit.compress.encoding import ColumnType, Encoding
@@ -191,6 +191,7 @@ __all__ = [
     "Optimizer",
     "OptimizerInput",
     "Partition",
+    "PhotoLight",
     "PhotoSkipped",
     "Pixels",
     "Plan",

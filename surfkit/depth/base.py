@@ -25,12 +25,15 @@ class DepthInput:
         observations: Where they show sparse points.
         device: Where to compute.
         work: A folder for what an interrupted estimate can go on from; it is deleted when all is done.
+        in_one_light: Whether the photographs are known to be, as rendered ones are. Their colours at sparse points are
+            not compared then, and the points need not be of the surface.
     """
 
     views: Sequence[View]
     observations: Observations
     device: torch.device
     work: Path
+    in_one_light: bool = False
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,8 @@ def light_of_tracks(given: DepthInput, picture: Callable[[int], PosedImage]) -> 
         given: The photographs, and where they show points.
         picture: Gives a photograph at any size.
     """
+    if given.in_one_light:
+        return Radiometry.unchanged(len(given.views))
     parts, step = [], -(-len(given.observations.xyz) // MAX_SHARED_PLACES)
     for number, view in enumerate(given.views):
         seen = given.observations.seen.get(view.name)

@@ -98,12 +98,8 @@ def run(
     """
     recipe = complete(recipe)
     run = Run(out, recipe, replace(data, path=data.path.resolve()))
-    compute, intervals, caches, meter = (
-        compute or Compute(),
-        intervals or Intervals(),
-        caches or CacheSettings(),
-        MemoryMeter(),
-    )
+    compute, intervals, caches = compute or Compute(), intervals or Intervals(), caches or CacheSettings()
+    meter = MemoryMeter()
     if intervals.pictures is None:
         intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_unready(run, compute, caches)

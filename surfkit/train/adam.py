@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,7 @@ def update(
         index: The step, from 1.
         first: Place in its column of the first value, for moments in 16 bits.
     """
-    width = value[:1].numel()
+    width = math.prod(value.shape[1:])
     if grad.numel() > VALUES_TOGETHER and not grad.is_contiguous():
         for some in _pieces(len(grad), width):  # copies of some rows at a time hold less than one of all
             update(value[some], grad[some], exp_avg[some], exp_avg_sq[some], rate, index, first + some.start * width)
@@ -169,7 +170,7 @@ def update_rows(
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
         native.kernels().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
-    width = value[:1].numel()
+    width = math.prod(value.shape[1:])
     if grad.numel() > VALUES_TOGETHER:
         for part in _pieces(len(rows), width):
             update_rows(value, rows[part], kept[part], grad[part], exp_avg, exp_avg_sq, rate, index)

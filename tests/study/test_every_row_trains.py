@@ -56,7 +56,7 @@ def test_every_row_trains(farm, out, name):
         assert row["failed"] is None, row
         known = {"seconds", "cpu_seconds", "peak_memory_bytes"}
         if not row["label"].startswith("stereo alone"):
-            known |= {"psnr", "ssim", "points", "bytes", "fps"}
+            known |= {"psnr", "psnr_aligned", "ssim", "ssim_aligned", "points", "bytes", "fps"}
         assert row["mean"].keys() == known, row["label"]
     if name == "model":
         rows = {row["label"]: row["mean"] for row in found["rows"]}

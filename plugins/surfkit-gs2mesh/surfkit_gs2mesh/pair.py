@@ -86,7 +86,7 @@ class Pair:
         known = Observations(xyz.numpy(), np.zeros(len(xyz)), seen)
         work = folder / "work"
         work.mkdir()
-        return DepthInput(views, known, torch.device("cpu"), work)
+        return DepthInput(views, known, torch.device("cpu"), work, in_one_light=True)
 
     def points(self) -> Tensor:
         """(P, 3) float64 places on rays of the left camera that the right one sees too."""

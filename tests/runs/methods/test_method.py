@@ -330,7 +330,7 @@ def test_a_table_compares_methods_with_splats(data, tmp_path):
     splats, plane, mean = rows = report["data_sets"][0]["rows"]
     assert not [row["failed"] for row in rows if row["failed"]]
     assert set(plane["mean"]) == {"seconds", "cpu_seconds", "peak_memory_bytes"}
-    assert set(mean["mean"]) == {*plane["mean"], "psnr", "ssim", "fps"}
+    assert set(mean["mean"]) == {*plane["mean"], "psnr", "psnr_aligned", "ssim", "ssim_aligned", "fps"}
     assert "points" in splats["mean"] and set(mean["difference"]) == set(mean["mean"])
     assert "| 2 | (plane) |" in (tmp_path / "ablation.md").read_text()
     lengths = [trial.recipe.length for trial in trials(AblationPlan(table, (data,), tmp_path, steps=6))]
