@@ -8,7 +8,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from surfkit.appearance.base import Appearance
+from surfkit.appearance.base import Appearance, PhotoLight
 from surfkit.primitives.points import Columns
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
@@ -16,9 +16,12 @@ from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 
 
-def fresh_appearances(value: Tensor) -> Columns:
-    """The table of photographs that begin with numbers (V, ...), a row each: "value", Adam's "first" and "second",
-    "shown" so often."""
+def first_appearances(model: Appearance, count: int, light: PhotoLight | None) -> Columns:
+    """The table of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often. It is empty
+    where the model needs to know their light and there is none: their colours stay as they are."""
+    if light is None and model.needs_light:
+        return {}
+    value = model.begin(count) if light is None else model.begin_with(light)
     moments = {name: torch.zeros_like(value) for name in ("first", "second")}
     return {"value": value, **moments, "shown": torch.zeros(len(value), dtype=torch.int64)}
 
@@ -29,7 +32,7 @@ class ImageAppearance:
 
     Attributes:
         model: What they mean.
-        table: The numbers of all photographs (`fresh_appearances`).
+        table: The numbers of all photographs (`first_appearances`).
         row: The photograph's.
         rate: The learning rate now.
         camera: That took it.
@@ -51,7 +54,7 @@ class ImageAppearance:
     @classmethod
     def of_step(cls, stage: Stage, state: StageState, at: int, camera: Camera) -> ImageAppearance | None:
         """That of photograph `at` in the coming step; None if the stage learns none."""
-        if stage.appearance is None:
+        if stage.appearance is None or not state.appearances:
             return None
         rate = stage.appearance.rate_at(state.index + 1, stage.steps) / 2**state.halvings
         return cls(stage.appearance, state.appearances, at, rate, camera)
