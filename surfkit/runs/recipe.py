@@ -181,10 +181,12 @@ class Recipe:
 
     @property
     def looks_for_uneven_light(self) -> list[str]:
-        """Dotted paths of the appearances of stages that change colours only where the light is uneven."""
+        """Appearances of stages that change colours only where the light is uneven, as on the command line."""
         stages = self.stages() if self.has_stages else ()
         found = ((path, stage.appearance) for path, stage, _ in stages)
-        return [f"{path}.appearance" for path, model in found if model is not None and model.only_if_uneven]
+        return [
+            f"{path}.appearance:{name_of(model)}" for path, model in found if model is not None and model.only_if_uneven
+        ]
 
     @property
     def length(self) -> int | None:

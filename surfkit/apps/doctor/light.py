@@ -55,4 +55,5 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
     text, has_tracks = f"{darkest!r} is the darkest photograph and {brightest!r} the brightest", gathered.capture.groups
     if has_tracks and not without:
         return [Finding("note", "exposure", f"{text}: {spread}; {looking[0]} makes up for it")]
-    return [Finding("warning", "exposure", f"{text}, and {spread.remedy(bool(has_tracks), [*without, *looking])}")]
+    settings = without + [each.partition(":")[0] for each in looking]
+    return [Finding("warning", "exposure", f"{text}, and {spread.remedy(bool(has_tracks), settings)}")]

@@ -50,6 +50,7 @@ COARSE_BASELINE = Recipe(
             "normal": NormalConsistency(weight=0.0125, start=7_000, depth="median"),
         },
         densify=ADC(cull_opacity=0.005),
+        appearance=city.LIGHT,
     ),
 )
 
