@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -152,6 +153,19 @@ def write_light(run: Run, record: LightRecord | None) -> None:
     if record is not None:
         write_json(run.light, record)
         emit(FileWritten(run.light, "exposures and vignetting"))
+
+
+def light_in_short(run: Run, found: LightRecord | None) -> dict[str, Any] | None:
+    """What run.json says: how far light differs, and whether colours are changed by it; None where nothing needs it.
+
+    Args:
+        run: Its light.json counts where nothing was `found` just now.
+        found: What light.json will say.
+    """
+    record = found or (read_json(run.light, LightRecord) if run.light.exists() else None)
+    if record is None:
+        return None
+    return {"is_used": record.is_used, **({} if record.spread is None else asdict(record.spread))}
 
 
 def light_of(run: Run, views: Sequence[View]) -> PhotoLight | None:

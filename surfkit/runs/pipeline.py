@@ -41,7 +41,7 @@ from surfkit.runs.make_levels import has_levels, make_wanted_levels
 from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate, measure_compressed
 from surfkit.runs.methods.base import Reconstruction
-from surfkit.runs.photo_light import LightRecord, needed_light, warn_of_light, write_light
+from surfkit.runs.photo_light import LightRecord, light_in_short, needed_light, warn_of_light, write_light
 from surfkit.runs.recipe import Recipe, complete, refuse_unused
 from surfkit.runs.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
 from surfkit.runs.run_cache import RunCache
@@ -130,7 +130,7 @@ def run(
         known = len(notes.texts)
         stages.begin()
         warned = notes.texts[known:]  # runs that take the stage repeat what its journal warns of
-        write_run_files(run, backend, caches, prints, notes, scene.frame)
+        write_run_files(run, backend, caches, prints, notes, scene.frame, light_in_short(run, stages.light))
         shares.take()
         with record_events(out, warned):
             made = reconstruct(run, given)

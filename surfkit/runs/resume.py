@@ -244,9 +244,16 @@ def _moved(run: Run, frame: Frame) -> str | None:
 
 
 def write_run_files(
-    run: Run, backend: str, caches: CacheSettings, prints: Fingerprint, notes: RunNotes, frame: Frame
+    run: Run,
+    backend: str,
+    caches: CacheSettings,
+    prints: Fingerprint,
+    notes: RunNotes,
+    frame: Frame,
+    light: dict[str, Any] | None = None,
 ) -> None:
-    """Write run.json, inputs.json and recipe.json; the recipe last, as it makes the folder a run."""
+    """Write run.json, inputs.json and recipe.json; the recipe last, as it makes the folder a run. `light` is what
+    run.json says of it, if anything."""
     before = read_record(run.out)
     notes.begin(
         run.record,
@@ -266,6 +273,7 @@ def write_run_files(
                 "crs": frame.crs,
                 "metres_per_unit": frame.metres,
             },
+            **({} if light is None else {"light": light}),
         },
         before,
     )

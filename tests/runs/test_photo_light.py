@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -141,6 +141,9 @@ def test_even_light_changes_nothing_where_only_uneven_light_is_looked_for(data, 
             assert "that is little, so colours stay as they are" in capsys.readouterr().err
     record = read_json(tmp_path / "looks/light.json", LightRecord)
     assert not record.is_used and not record.photographs and 0 < record.spread.stops < 0.5
+    told = read_json(tmp_path / "looks/run.json", dict[str, Any])["light"]
+    assert told == {"is_used": False, **asdict(record.spread)}
+    assert "light" not in read_json(tmp_path / "plain/run.json", dict[str, Any])
     assert not made["looks"].appearances
     same = made["plain"].points.params.items()
     assert all(torch.equal(value, made["looks"].points.params[name]) for name, value in same)
