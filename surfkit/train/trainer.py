@@ -67,7 +67,7 @@ class Trainer(StageSetup):
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if (model := self.stage.appearance) is not None:
             value = model.begin(len(self.views)) if light is None else model.begin_with(light)
-            state.appearances = fresh_appearances(value)
+            state.appearances = fresh_appearances(value, model.begin_shared())
         state.move(self.rasterizer.where(), self.home)
         return state
 

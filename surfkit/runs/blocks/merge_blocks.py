@@ -76,7 +76,7 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     if (model := recipe.tune.appearance) is not None:  # what blocks learned is folded into their colours
         views = ctx.scene.train
         known = model.begin_with(light_of(ctx.run, views)) if model.needs_light else model.begin(len(views))
-        state.appearances = fresh_appearances(known)
+        state.appearances = fresh_appearances(known, model.begin_shared())
     return state
 
 
