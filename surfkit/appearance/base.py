@@ -46,6 +46,12 @@ class Appearance(Component):
     needs_light: ClassVar[bool] = False
     spares_structure: ClassVar[bool] = False
 
+    @property
+    def only_if_uneven(self) -> bool:
+        """Whether colours stay as they are where the light of all photographs is alike; of models that `needs_light`.
+        A stage then works as without any appearance."""
+        return False
+
     def refuse_unfit(self, primitive: Primitive) -> None:  # noqa: B027 (some fit all)
         """BadInput if the colours of this primitive cannot be changed by it; asked before anything is trained."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -47,7 +47,17 @@ class CameraResponse(Appearance):
     that all photographs share cannot be told from the scene: one camera alone has the sRGB curve.
     """
 
+    when: Literal["always", "uneven"] = "always"
+    """uneven: only where the same places look different, by 0.5 stops of exposure or 10 % of white balance (10th to
+    90th percentile), by corners with 80 % of the light of the middle, or by 3 % of the range between the curves of
+    cameras. Else, and where no sparse points tell, colours stay as they are; light.json says which."""
+
     needs_light: ClassVar[bool] = True
+
+    @property
+    def only_if_uneven(self) -> bool:
+        """See `Appearance.only_if_uneven`."""
+        return self.when == "uneven"
 
     def begin(self, count: int) -> Tensor:
         """(V, 11): stops of red, green and blue, and the 8 numbers of the camera; zeros."""

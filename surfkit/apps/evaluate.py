@@ -159,10 +159,10 @@ class EvaluateCommand:
             metrics = note_metrics(run.metrics, mesh_alone(surface, scene))
         if zones != Zones():
             assert made.draw is not None, "a run that draws nothing is refused"
-            found = measure_zones(scene, made.draw, zones, rendered_depths(made.draw), seams)
+            found = measure_zones(scene, made.photographed(made.draw), zones, rendered_depths(made.draw), seams)
             metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
         if tree is not None:
-            levels = measure_levels(tree, scene, ctx.rasterizer, self.lod_pixels)
+            levels = measure_levels(made, tree, scene, ctx.rasterizer, self.lod_pixels)
             metrics = note_metrics(run.metrics, {"lod": levels})
         if self.compressed:
             note_compressed(opened(self.target), metrics)
@@ -231,7 +231,7 @@ class EvaluateCommand:
                 run, scene = ctx.run, ctx.scene
                 depths = rendered_depths(made.draw) if truth is None else true_depths(truth, scene.frame, matrix)
                 seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
-                return measure_zones(scene, made.draw, zones, depths, seams)
+                return measure_zones(scene, made.photographed(made.draw), zones, depths, seams)
 
     def _scene(self, run: Run | None) -> Scene | None:
         """The scene whose views make the crop volume; None where nobody names one."""

@@ -182,10 +182,13 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
     return tree
 
 
-def measure_levels(tree: LodTree, scene: Scene, rasterizer: Rasterizer, pixels: float) -> dict[str, Any]:
+def measure_levels(
+    made: Reconstruction, tree: LodTree, scene: Scene, rasterizer: Rasterizer, pixels: float
+) -> dict[str, Any]:
     """Size, quality and speed of each level where all views show it, and of blocks that are selected for each view.
 
     Args:
+        made: What the levels were made of.
         tree: The levels.
         scene: With held-out views for the quality; without any, training views are drawn for the speed alone.
         rasterizer: What draws.
@@ -206,7 +209,7 @@ def measure_levels(tree: LodTree, scene: Scene, rasterizer: Rasterizer, pixels: 
         return lambda view: splats
 
     def measured(points: float, draw: Draw) -> dict[str, Any]:
-        return {"points": round(points), "bytes": round(points * row_bytes), **_measure(scene, draw)}
+        return {"points": round(points), "bytes": round(points * row_bytes), **_measure(scene, made, draw)}
 
     rows = []
     for level in tree.levels:
@@ -217,11 +220,12 @@ def measure_levels(tree: LodTree, scene: Scene, rasterizer: Rasterizer, pixels: 
     return {"levels": rows, "selected": selected, "pixels": pixels}
 
 
-def _measure(scene: Scene, draw: Draw) -> dict[str, Any]:
+def _measure(scene: Scene, made: Reconstruction, draw: Draw) -> dict[str, Any]:
     """PSNR and SSIM of held-out views, and frames per second."""
     views = scene.held_out
     if not views:
         return {"psnr": None, "ssim": None, "fps": frames_per_second(scene.train, draw)}
     ahead = PHOTOS_AHEAD * max(3 * view.camera.width * view.camera.height for view in views)
-    found = evaluate_views(views, photo_cache(views, ahead), draw, masks=mask_cache(views, ahead))
+    shown, masks = made.photographed(draw), mask_cache(views, ahead)
+    found = evaluate_views(views, photo_cache(views, ahead), shown, timed=draw, masks=masks)
     return {"psnr": found["images"]["psnr"], "ssim": found["images"]["ssim"], "fps": found["fps"]}

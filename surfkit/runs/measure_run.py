@@ -60,7 +60,7 @@ def evaluate(
             measured = evaluate_views(
                 scene.held_out,
                 photo_cache(scene.held_out, ahead),
-                made.draw_there or made.draw,
+                made.photographed(made.draw_there or made.draw),
                 timed=colors,
                 show=show,
                 masks=mask_cache(scene.held_out, ahead),
@@ -107,7 +107,7 @@ def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
     found = evaluate_views(
         scene.held_out,
         photo_cache(scene.held_out, ahead),
-        drawing_colors(made),
+        made.photographed(drawing_colors(made)),
         masks=mask_cache(scene.held_out, ahead),
     )["images"]
     write_json(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,7 +17,9 @@ from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.registry import name_of
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
+from surfkit.raster.api import Maps
 from surfkit.runs.folder import Run
+from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
 GROUPS, GROUP = 5, 20
@@ -62,11 +64,16 @@ class LightRecord:
         photographs: Training photographs by name.
         cameras: By what tells them apart.
         deviation: Standard deviation of colours of the same place that is left, in [0, 1].
+        spread: How far photographs differ, of all or of `sampled` ones; None where nothing tells.
+        is_used: Whether colours are changed by it. They are not where an appearance wants to only if light is uneven,
+            and it is not, or nothing tells; there are no numbers then.
     """
 
     photographs: dict[str, PhotoNumbers]
     cameras: dict[str, CameraNumbers]
     deviation: float
+    spread: LightSpread | None = None
+    is_used: bool = True
 
 
 def needed_light(run: Run, scene: Scene) -> LightRecord | None:
@@ -76,18 +83,24 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
         BadInput: Nothing tells which photographs show which points.
     """
     found = [stage.stage.appearance for stage in run.stages]
-    model = next((each for each in found if each is not None and each.needs_light), None)
-    if model is None or run.light.exists():
+    models = [each for each in found if each is not None and each.needs_light]
+    if not models or run.light.exists():
         return None
-    tracks = observations(run.data, scene)
-    if tracks.is_empty:
+    tracks, is_wanted = observations(run.data, scene), not all(model.only_if_uneven for model in models)
+    if tracks.is_empty and is_wanted:
         raise BadInput(
-            f"{run.data.path}: appearance {name_of(model)} needs the sparse points that each photograph shows, and the "
-            f"data set has none; {points_remedy(run.data.path, (view.name for view in scene.train))}, or choose "
+            f"{run.data.path}: appearance {name_of(models[0])} needs the sparse points that each photograph shows, and "
+            f"the data set has none; {points_remedy(run.data.path, (view.name for view in scene.train))}, or choose "
             "appearance:exposure, which learns from the photographs alone"
         )
+    if tracks.is_empty:
+        say("light of the photographs: not known, as nothing tells which show which points; colours stay as they are")
+        return LightRecord({}, {}, 0.0, None, is_used=False)
+    if not is_wanted and not (spread := spread_of(sampled(scene.train), tracks)).is_uneven:
+        say(f"light of the photographs: {spread}; that is little, so colours stay as they are")
+        return LightRecord({}, {}, 0.0, spread, is_used=False)
     light = fit_light(track_colors(scene.train, tracks), rows_of(scene.train))
-    say(f"light of the photographs: {LightSpread.of(light)}")
+    say(f"light of the photographs: {LightSpread.of(light)}; colours are compared in the light of each")
     if unknown := [view.name for view, seen in zip(scene.train, light.seen, strict=True) if seen < MIN_SEEN]:
         emit(
             Warned(
@@ -99,20 +112,25 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
 
 
 def warn_of_light(run: Run, scene: Scene) -> None:
-    """Say how far light differs between photographs, where it is uneven and a stage takes all colours as they are.
-
-    Of many photographs, some are looked at: groups that follow one another in the order of their names.
-    """
+    """Say how far light differs between photographs, where it is uneven and a stage takes all colours as they are."""
     settings = run.recipe.without_appearance
     if not settings or (tracks := observations(run.data, scene)).is_empty:
         return
-    views = scene.train
-    if len(views) > GROUPS * GROUP:
-        starts = np.linspace(0, len(views) - GROUP, GROUPS).astype(int)
-        views = tuple(view for start in starts for view in views[start : start + GROUP])
-    spread = LightSpread.of(fit_light(track_colors(views, tracks), rows_of(views)))
-    if spread.is_uneven:
+    if (spread := spread_of(sampled(scene.train), tracks)).is_uneven:
         emit(Warned(spread.remedy(True, settings)))
+
+
+def sampled(views: Sequence[View]) -> Sequence[View]:
+    """Views that tell how far light differs: of many, groups that follow one another in the order of their names."""
+    if len(views) <= GROUPS * GROUP:
+        return views
+    starts = np.linspace(0, len(views) - GROUP, GROUPS).astype(int)
+    return tuple(view for start in starts for view in views[start : start + GROUP])
+
+
+def spread_of(views: Sequence[View], tracks: Observations) -> LightSpread:
+    """How far the light of some photographs differs."""
+    return LightSpread.of(fit_light(track_colors(views, tracks), rows_of(views)))
 
 
 def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:
@@ -126,7 +144,7 @@ def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:
         name: CameraNumbers(*(tuple(numbers[part].tolist()) for part in (FALLOFF, CENTRE, CURVE)))
         for name, numbers in zip(names, light.cameras, strict=True)
     }
-    return LightRecord(photographs, cameras, light.deviation)
+    return LightRecord(photographs, cameras, light.deviation, LightSpread.of(light))
 
 
 def write_light(run: Run, record: LightRecord | None) -> None:
@@ -136,18 +154,44 @@ def write_light(run: Run, record: LightRecord | None) -> None:
         emit(FileWritten(run.light, "exposures and vignetting"))
 
 
-def light_of(run: Run, views: Sequence[View]) -> PhotoLight:
-    """What light.json says of some views.
+def light_of(run: Run, views: Sequence[View]) -> PhotoLight | None:
+    """What light.json says of some views; None where it changes no colour.
 
     Raises:
         BadInput: It is not there, damaged, or does not know one of them.
     """
     record = read_json(run.light, LightRecord)
+    if not record.is_used:
+        return None
     known = [(record.photographs.get(view.name), view.name) for view in views]
     if lost := [name for one, name in known if one is None or one.camera not in record.cameras]:
         raise BadInput(f"{run.light}: it lacks {few(lost)}; delete it and train again, which writes it again")
     photographs = [one for one, _ in known if one is not None]
-    cameras = [record.cameras[one.camera] for one in photographs]
+    return _photo_light([one.stops for one in photographs], [record.cameras[one.camera] for one in photographs])
+
+
+def held_out_response(run: Run) -> Callable[[View, Maps], Maps] | None:
+    """What turns maps of held-out views into what the cameras of light.json take: with vignetting and response curve.
+
+    Their exposure is that of the mean photograph: only they could tell theirs, and they are measured against. None
+    where nothing is known of any camera.
+    """
+    model = run.last.stage.appearance if run.recipe.has_stages else None
+    if model is None or not model.needs_light or not run.light.exists():
+        return None
+    cameras = read_json(run.light, LightRecord).cameras
+
+    def respond(view: View, maps: Maps) -> Maps:
+        camera = cameras.get(view.taken_by)
+        if camera is None:
+            return maps
+        numbers, color = model.begin_with(_photo_light([(0.0, 0.0, 0.0)], [camera]))[0], maps.need("color")
+        with torch.no_grad():
+            return replace(maps, color=model(numbers.to(color), color, view.camera))
+
+    return respond if cameras else None
+
+
+def _photo_light(stops: Sequence[tuple[float, float, float]], cameras: Sequence[CameraNumbers]) -> PhotoLight:
     numbers = np.array([[*camera.falloff, *camera.centre, *camera.curve] for camera in cameras], np.float32)
-    stops = np.array([one.stops for one in photographs], np.float32)
-    return PhotoLight(torch.from_numpy(stops), torch.from_numpy(numbers))
+    return PhotoLight(torch.tensor(stops, dtype=torch.float32), torch.from_numpy(numbers))

@@ -180,6 +180,15 @@ class Recipe:
         return [f"{name}.appearance" for name, stage in stages.items() if stage.appearance is None]
 
     @property
+    def looks_for_uneven_light(self) -> list[str]:
+        """Appearances of stages that change colours only where the light is uneven, as on the command line."""
+        stages = self.stages() if self.has_stages else ()
+        found = ((path, stage.appearance) for path, stage, _ in stages)
+        return [
+            f"{path}.appearance:{name_of(model)}" for path, model in found if model is not None and model.only_if_uneven
+        ]
+
+    @property
     def length(self) -> int | None:
         """Optimisation steps of the first stage, or of the whole method; None if there are none."""
         return self.pretrain.steps if self.has_stages else self.method.length()

@@ -36,6 +36,7 @@ from surfkit.runs.command import train_command
 from surfkit.runs.context import RunContext
 from surfkit.runs.folder import Run, discard_results
 from surfkit.runs.methods.base import MethodInput, Reconstruction
+from surfkit.runs.photo_light import held_out_response
 from surfkit.scene.cache import Cache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
@@ -356,6 +357,7 @@ def optimised(run: Run, state: StageState) -> Reconstruction:
         cpu_seconds=state.cpu_seconds,
         peak_memory_bytes=state.peak_memory_bytes,
         peak_gpu_bytes=state.peak_gpu_bytes,
+        respond=held_out_response(run),
     )
 
 

@@ -17,6 +17,7 @@ from surfkit.runs.journal import record_events
 from surfkit.runs.make_mesh import mesh_input
 from surfkit.runs.measure_run import measure_before
 from surfkit.runs.methods.base import Reconstruction
+from surfkit.runs.photo_light import held_out_response
 from surfkit.runs.run_method import with_drawing
 from surfkit.runs.run_notes import prefix_notes
 from surfkit.runs.run_stage import StageJob, drawing, load_state, optimise
@@ -57,7 +58,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     def made() -> Reconstruction:  # made when it is needed, as its activated values take memory
         model = SplatModel(before.primitive, before.stage.finished(given), given.sh_degree, before.stage.near)
-        return with_drawing(Reconstruction(splats=model), ctx.rasterizer)
+        return with_drawing(Reconstruction(splats=model, respond=held_out_response(run)), ctx.rasterizer)
 
     def start(_: torch.Generator) -> InitialModel:
         found = made()

@@ -22,7 +22,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, select
 from surfkit.runs.folder import Run, RunStage
-from surfkit.runs.photo_light import light_of
+from surfkit.runs.photo_light import held_out_response, light_of
 from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
@@ -235,7 +235,12 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     at, intervals, meter = job.stage, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
     emit(StageBegan(at.name, steps, len(state.points), state.index + 1, at.block))
-    clock, draw = Stopwatch(state), live_drawing(job, trainer, state)
+    clock, draw, respond = Stopwatch(state), live_drawing(job, trainer, state), held_out_response(job.run)
+
+    def taken(view: View) -> Maps:
+        maps = drawn_now(trainer, state, view)
+        return maps if respond is None else respond(view, maps)
+
     with (
         graceful() as request,
         TrainingDisplay(at.title, steps) as display,
@@ -251,7 +256,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
                     state.move(trainer.rasterizer.where(), home)
             if along is not None and intervals.pictures and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
-                    along.look(done.index, lambda view: drawn_now(trainer, state, view))
+                    along.look(done.index, taken)
             is_over = request.asked or done.index == job.until
             if is_over or done.index % intervals.checkpoint == 0 or done.index == steps:
                 save(at, state, meter)

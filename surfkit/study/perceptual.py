@@ -50,10 +50,11 @@ def measure_lpips(folder: Path, device: Device) -> dict[str, Any]:
         images, each = metrics["images"], metrics["images"].get("per_image", {})
         views = [view for view in ctx.scene.held_out if view.name in each]  # others could not be read
         masks = mask_cache(views, 0)
+        draw = made.photographed(made.draw_color or made.draw)
         for at, view in enumerate(views):
             mask = None if masks is None else masks[at]
             if mask is None or mask.any():
-                color = (made.draw_color or made.draw)(view).need("color").clamp(0, 1)
+                color = draw(view).need("color").clamp(0, 1)
                 mask = None if mask is None else mask.to(color.device)
                 found[view.name] = lpips_values([network], color, view_photo(view).to(color) / 255, mask)
         images |= {name: statistics.fmean(one[name] for one in found.values()) for name in lpips_names([network])}

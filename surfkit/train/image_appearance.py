@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from surfkit.appearance.base import Appearance, joined
+from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.primitives.points import Columns
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
@@ -16,14 +16,18 @@ from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 
 
-def fresh_appearances(value: Tensor, shared: Tensor) -> Columns:
-    """The table of photographs that begin with numbers (V, ...), a row each: "value", Adam's "first" and "second",
-    "shown" so often. Where all share some numbers, (S,), also "shared" with "shared_first" and "shared_second"."""
+def first_appearances(model: Appearance, count: int, light: PhotoLight | None) -> Columns:
+    """The table of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often. Where all
+    share some numbers, (S,), also "shared" with "shared_first" and "shared_second". It is empty where the model needs
+    to know their light and there is none: their colours stay as they are."""
+    if light is None and model.needs_light:
+        return {}
+    value, shared = model.begin(count) if light is None else model.begin_with(light), model.begin_shared()
     table = {"value": value, "first": torch.zeros_like(value), "second": torch.zeros_like(value)}
     if len(shared):
         moments = {f"shared_{name}": torch.zeros_like(shared) for name in ("first", "second")}
         table |= {"shared": shared, **moments}
-    return table | {"shown": torch.zeros(len(value), dtype=torch.int64)}
+    return table | {"shown": torch.zeros(count, dtype=torch.int64)}
 
 
 @dataclass
@@ -32,7 +36,7 @@ class ImageAppearance:
 
     Attributes:
         model: What they mean.
-        table: The numbers of all photographs (`fresh_appearances`).
+        table: The numbers of all photographs (`first_appearances`).
         row: The photograph's.
         rate: The learning rate now.
         camera: That took it.
@@ -56,7 +60,7 @@ class ImageAppearance:
     @classmethod
     def of_step(cls, stage: Stage, state: StageState, at: int, camera: Camera) -> ImageAppearance | None:
         """That of photograph `at` in the coming step; None if the stage learns none."""
-        if stage.appearance is None:
+        if stage.appearance is None or not state.appearances:
             return None
         rate = stage.appearance.rate_at(state.index + 1, stage.steps) / 2**state.halvings
         return cls(stage.appearance, state.appearances, at, rate, camera)

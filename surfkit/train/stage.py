@@ -95,7 +95,9 @@ class Stage:
     def finished(self, state: StageState) -> Columns:
         """Raw parameters of the points as they leave the stage, in the colours of the mean photograph."""
         params = state.points.all_params()
-        return params if self.appearance is None else self.appearance.folded(state.appearances["value"], params)
+        if self.appearance is None or not state.appearances:
+            return params
+        return self.appearance.folded(state.appearances["value"], params)
 
 
 def rates_of(stage: Stage, primitive: Primitive) -> dict[str, LearningRate]:

@@ -17,7 +17,7 @@ from surfkit.primitives.edit import OBSERVED_EVERY, observe
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
-from surfkit.train.image_appearance import fresh_appearances
+from surfkit.train.image_appearance import first_appearances
 from surfkit.train.next_view import foretell
 from surfkit.train.retry_on_oom import retry_on_oom
 from surfkit.train.setup import StageSetup
@@ -55,7 +55,7 @@ class Trainer(StageSetup):
             points: To begin with.
             generator: That of the stage.
             frozen: As in `StageState`.
-            light: That of the photographs, where the appearance needs it; None begins with numbers that change nothing.
+            light: That of the photographs, where the appearance needs it; None changes no colour.
         """
         declared = set(self.primitive.columns())
         if set(points.all_params()) != declared:
@@ -66,8 +66,7 @@ class Trainer(StageSetup):
         points = points.with_moments(self.stage.optimizer.moment_type())
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if (model := self.stage.appearance) is not None:
-            value = model.begin(len(self.views)) if light is None else model.begin_with(light)
-            state.appearances = fresh_appearances(value, model.begin_shared())
+            state.appearances = first_appearances(model, len(self.views), light)
         state.move(self.rasterizer.where(), self.home)
         return state
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from surfkit.core.codec import read_json
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.partition import PictureShare, QuantileGrid
+from surfkit.raster.psnr import psnr
 from surfkit.runs import photo_light, pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.photo_light import LightRecord, light_of
-from surfkit.runs.pipeline import load_run, opened, run
+from surfkit.runs.pipeline import load_run, loaded, opened, run
 from surfkit.runs.recipe import Recipe
+from surfkit.scene.photos import view_photo
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -124,3 +127,52 @@ def test_of_many_photographs_some_are_looked_at(data, recipe, monkeypatch):
     photo_light.warn_of_light(Run(data.path / "run", plain, data), scene)
     names = [view.name for view in scene.train]
     assert [view.name for view in looked[0]] == [*names[:3], *names[-3:]]
+
+
+def test_even_light_changes_nothing_where_only_uneven_light_is_looked_for(data, recipe, tmp_path, capsys):
+    even = tmp_path / "even"
+    write_colmap(even, photograph(Flight(views=9, width=64, height=48, points=400)), tracks=True)
+    looks = replace(recipe.pretrain, steps=3, appearance=CameraResponse("uneven"))
+    made = {}
+    for name, stage in {"looks": looks, "plain": replace(looks, appearance=None)}.items():
+        run(replace(recipe, pretrain=stage), Data(even, test_every=3), tmp_path / name, Compute("cpu"), EVERY)
+        made[name] = load_run(tmp_path / name)[1]
+        if name == "looks":
+            assert "that is little, so colours stay as they are" in capsys.readouterr().err
+    record = read_json(tmp_path / "looks/light.json", LightRecord)
+    assert not record.is_used and not record.photographs and 0 < record.spread.stops < 0.5
+    assert not made["looks"].appearances
+    same = made["plain"].points.params.items()
+    assert all(torch.equal(value, made["looks"].points.params[name]) for name, value in same)
+
+    run(replace(recipe, pretrain=looks), data, tmp_path / "uneven", Compute("cpu"), EVERY)
+    assert read_json(tmp_path / "uneven/light.json", LightRecord).is_used
+    assert load_run(tmp_path / "uneven")[1].appearances["value"].abs().max() > 0.4
+
+
+def test_without_tracks_light_that_is_only_looked_for_is_not_known(recipe, tmp_path, capsys):
+    write_colmap(tmp_path / "data", photograph(Flight(views=6, width=32, height=24, points=60)))
+    stage = replace(recipe.pretrain, steps=2, appearance=CameraResponse("uneven"))
+    run(replace(recipe, pretrain=stage), Data(tmp_path / "data", test_every=0), tmp_path / "run", Compute("cpu"), EVERY)
+    assert "light of the photographs: not known" in capsys.readouterr().err
+    record = read_json(tmp_path / "run/light.json", LightRecord)
+    assert not record.is_used and record.spread is None
+
+
+def test_held_out_photographs_are_drawn_as_their_camera_takes_them(recipe, tmp_path):
+    """Dark corners of the training photographs are those of held-out ones: renders have them too."""
+    folder = tmp_path / "dark"
+    write_colmap(folder, photograph(Flight(views=16, width=64, height=48, points=600)), tracks=True)
+    y, x = (np.indices((48, 64)) + 0.5 - np.array([24, 32])[:, None, None]) / 40  # halves of the diagonal
+    for path in (folder / "images").iterdir():
+        light = linear(np.asarray(Image.open(path)) / 255) * 2.0 ** -(1.5 * (x * x + y * y))[..., None]
+        Image.fromarray((from_linear(light.clip(0, 1)) * 255).round().astype(np.uint8)).save(path)
+    stage = replace(recipe.pretrain, steps=2, appearance=CameraResponse("uneven"))
+    run(replace(recipe, pretrain=stage), Data(folder, test_every=4), tmp_path / "run", Compute("cpu"), EVERY)
+    with loaded(tmp_path / "run", "cpu") as (ctx, made):
+        view = ctx.scene.held_out[0]
+        plain, taken = (draw(view).need("color") for draw in (made.draw, made.photographed(made.draw)))
+        stops = np.log2(linear(taken.numpy()).clip(1e-6) / linear(plain.numpy()).clip(1e-6))
+        assert np.abs(stops[:, 24, 32]).max() < 0.1 and -2.0 < np.median(stops[:, 0, 0]) < -1.0
+        wanted, photo = read_json(tmp_path / "run/metrics.json", dict[str, Any]), view_photo(view).float() / 255
+        assert wanted["images"]["per_image"][view.name]["psnr"] == pytest.approx(psnr(taken.clamp(0, 1), photo), 1e-4)

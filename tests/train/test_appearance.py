@@ -11,7 +11,7 @@ from surfkit.losses.base import Target
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.raster.api import Maps
 from surfkit.train.checkpoint import load, save
-from surfkit.train.image_appearance import ImageAppearance, fresh_appearances
+from surfkit.train.image_appearance import ImageAppearance, first_appearances
 from surfkit.train.loss_gradients import loss_gradients
 from surfkit.train.stage import Stage
 
@@ -83,7 +83,7 @@ def test_shared_numbers_are_learned_in_every_step_and_saved(begin, tmp_path):
 
 def test_adam_counts_the_steps_of_all_photographs_for_what_they_share(begin):
     """A gradient that is always the same moves by the rate at each step, if moments are corrected by their steps."""
-    table, camera = fresh_appearances(torch.zeros(2, 1), torch.zeros(3)), begin(Stage())[0].views[0].camera
+    table, camera = first_appearances(Tint(), 2, None), begin(Stage())[0].views[0].camera
     for at in (0, 1, 1, 0, 1):
         step = ImageAppearance(Tint(), table, at, 0.1, camera)
         step.add([torch.ones(1), None])
@@ -110,7 +110,8 @@ def test_structure_is_compared_without_the_change_and_gradients_are_those_of_dif
     view = begin(Stage())[0].views[0]
     losses, weights, keep = {"l1": L1(), "ssim": SSIM()}, {"l1": 0.8, "ssim": 0.2}, mask if masked else None
     target = Target(view, photo, mask=keep)
-    appearance = ImageAppearance(Tint(), fresh_appearances(numbers[None, :1], numbers[1:]), 0, 1.0, view.camera)
+    table = first_appearances(Tint(), 1, None) | {"value": numbers[None, :1], "shared": numbers[1:]}
+    appearance = ImageAppearance(Tint(), table, 0, 1.0, view.camera)
     given = losses, LossGradient(terms=terms), weights, Maps(color=color), target, appearance
     found, total, chosen = loss_gradients(*given)
 

@@ -54,5 +54,8 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
 
 @hookimpl
 def surfkit_rows() -> Mapping[str, tuple[Row, ...]]:
-    """The row of the comparison of methods; CityGaussianV2 has no figures for it."""
-    return {"methods": (Row("PGSR", recipe=PGSR, kept=False),)}
+    """Rows of the comparison of methods, where CityGaussianV2 has no figures for it, and of appearances."""
+    return {
+        "methods": (Row("PGSR", recipe=PGSR, kept=False),),
+        "appearance": (Row("gain and offset", {"pretrain.appearance": GainOffset()}, kept=False),),
+    }

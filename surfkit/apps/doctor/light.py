@@ -19,7 +19,7 @@ MIN_PHOTOGRAPHS = 3
 
 
 def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.ndarray, recipe: Recipe) -> list[Finding]:
-    """A warning where light differs between photographs and the recipe learns nothing of it.
+    """A warning where light differs between photographs and the recipe learns nothing of it; a note where it will.
 
     Sparse points are looked for in all photographs whose cameras have them in view. Those that something hides there
     are told by their colours, which fit no others.
@@ -32,7 +32,8 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
     """
     colors = {name: look.colors for name, look in known.items() if look.colors is not None and not look.flat}
     shots = [shot for shot in gathered.capture.shots if shot.name in colors]
-    if len(shots) < MIN_PHOTOGRAPHS or not recipe.without_appearance:
+    without, looking = recipe.without_appearance, recipe.looks_for_uneven_light
+    if len(shots) < MIN_PHOTOGRAPHS or not (without or looking):
         return []
     parts = []
     for at, shot in enumerate(shots):
@@ -51,6 +52,8 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
         return []
     exposure = np.where(light.seen >= MIN_SEEN, light.stops.mean(1), 0)
     darkest, brightest = shots[int(exposure.argmin())].name, shots[int(exposure.argmax())].name
-    text = spread.remedy(bool(gathered.capture.groups), recipe.without_appearance)
-    text = f"{darkest!r} is the darkest photograph and {brightest!r} the brightest, and {text}"
-    return [Finding("warning", "exposure", text)]
+    text, has_tracks = f"{darkest!r} is the darkest photograph and {brightest!r} the brightest", gathered.capture.groups
+    if has_tracks and not without:
+        return [Finding("note", "exposure", f"{text}: {spread}; {looking[0]} makes up for it")]
+    settings = without + [each.partition(":")[0] for each in looking]
+    return [Finding("warning", "exposure", f"{text}, and {spread.remedy(bool(has_tracks), settings)}")]

@@ -18,7 +18,7 @@ from surfkit.runs.blocks.rounds import AgreedMerge, finished_piece
 from surfkit.runs.context import RunContext
 from surfkit.runs.photo_light import light_of
 from surfkit.train import checkpoint, streaming
-from surfkit.train.image_appearance import fresh_appearances
+from surfkit.train.image_appearance import first_appearances
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 from surfkit.train.streaming import StoredState
@@ -75,8 +75,8 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     state.sh_degree = max(part.sh_degree for part in parts)
     if (model := recipe.tune.appearance) is not None:  # what blocks learned is folded into their colours
         views = ctx.scene.train
-        known = model.begin_with(light_of(ctx.run, views)) if model.needs_light else model.begin(len(views))
-        state.appearances = fresh_appearances(known, model.begin_shared())
+        light = light_of(ctx.run, views) if model.needs_light else None
+        state.appearances = first_appearances(model, len(views), light)
     return state
 
 

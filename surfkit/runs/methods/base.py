@@ -32,6 +32,8 @@ class Reconstruction:
         draw_there: The same, with maps that stay on the device that draws; None for `draw`.
         draw_color: The same as `draw_there` with colours alone, whose speed is measured; None for `draw`.
         draw_of: Draws given splats as `draw` does all of `splats`; None where `draw` is the method's own.
+        respond: What the camera of a held-out photograph makes of maps that were drawn of its view: vignetting and
+            response curve. None for nothing.
         facts: Plain values for metrics.json, under "method".
         steps: Optimisation steps that were made, of all stages; 0 for a method without any.
         last_steps: Those of the last stage, where there are several.
@@ -47,6 +49,7 @@ class Reconstruction:
     draw_there: Callable[[View], Maps] | None = None
     draw_color: Callable[[View], Maps] | None = None
     draw_of: Callable[[Splats], Callable[[View], Maps]] | None = None
+    respond: Callable[[View, Maps], Maps] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
     last_steps: int = 0
@@ -54,6 +57,11 @@ class Reconstruction:
     cpu_seconds: float | None = None
     peak_memory_bytes: int | None = None
     peak_gpu_bytes: int | None = None
+
+    def photographed(self, draw: Callable[[View], Maps]) -> Callable[[View], Maps]:
+        """What draws views as the cameras of held-out photographs take them, from what draws the scene."""
+        respond = self.respond
+        return draw if respond is None else lambda view: respond(view, draw(view))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from surfkit.appearance.camera_response import CameraResponse
+from surfkit.appearance.exposure import Exposure
 from surfkit.compress.vectree import Vectree
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
@@ -50,6 +52,7 @@ COARSE_BASELINE = Recipe(
             "normal": NormalConsistency(weight=0.0125, start=7_000, depth="median"),
         },
         densify=ADC(cull_opacity=0.005),
+        appearance=city.LIGHT,
     ),
 )
 
@@ -332,8 +335,29 @@ PARTITION_TABLE = Table(
     ),
 )
 
+# Give it a data set of one light and one whose light changes. Plugin packages add rows.
+APPEARANCE_TABLE = Table(
+    "appearance",
+    "How light that changes from photograph to photograph is made up for",
+    RECIPES["2dgs"],
+    (
+        Row("colours as they are"),
+        Row("exposure", {"pretrain.appearance": Exposure()}, kept=False),
+        Row("camera response", {"pretrain.appearance": CameraResponse()}, kept=False),
+    ),
+    columns=("psnr_aligned", "ssim_aligned"),
+)
+
 TABLES = {
     table.name: table
-    for table in (MODEL_TABLE, GRADIENT_TABLE, SURFACE_TABLE, METHODS_TABLE, TRIM_TABLE, PARTITION_TABLE)
+    for table in (
+        MODEL_TABLE,
+        GRADIENT_TABLE,
+        SURFACE_TABLE,
+        METHODS_TABLE,
+        TRIM_TABLE,
+        PARTITION_TABLE,
+        APPEARANCE_TABLE,
+    )
 }
 """The tables that `surfkit ablate table:NAME` accepts."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from surfkit.appearance.camera_response import CameraResponse
 from surfkit.compress.levels.pruned_levels import PrunedLevels
 from surfkit.compress.vectree import Vectree
 from surfkit.core.schedule import LearningRate
@@ -30,6 +31,8 @@ LOSSES = {
     "normal": NormalConsistency(weight=0.0125, start=7_000, depth="median"),
     "depth": DepthRegression(start=0.5, end=0.0025),
 }
+# The paper takes colours as they are, and names light that changes as a limit of its method.
+LIGHT = CameraResponse("uneven")
 TUNED_LOSSES = LOSSES | {"normal": NormalConsistency(weight=0.0125, start=0, depth="median")}
 
 
@@ -51,6 +54,7 @@ CITY_COARSE = Recipe(
         losses=LOSSES,
         signal=LossGradient(terms=("ssim",), boost=0.9),
         densify=ADC(cull_opacity=0.005, filters=ELONGATION_FILTERS),
+        appearance=LIGHT,
     ),
     mesh=TSDF(),
 )

@@ -101,6 +101,7 @@ RELEASED = replace(
         CITY.pretrain,
         losses=LOSSES | {"depth": DepthRegression(start=0.5, end=0.0025, error="ssim")},
         signal=RELEASED_SIGNAL,
+        appearance=None,
     ),
     partition=QuantileGrid(blocks=(4, 2)),
     tune=replace(
@@ -109,6 +110,7 @@ RELEASED = replace(
         signal=RELEASED_SIGNAL,
         densify=ADC(threshold=3e-4, cull_opacity=0.005, filters=ELONGATION_FILTERS),
         prune=(Trim(ratio=0.05, score="released", whole_epochs=False, recovery=0),),
+        appearance=None,
     ),
     context="densified",
     mesh=TSDF(voxel=1.0, truncation=4.0, depth_limit=200.0),
@@ -134,9 +136,9 @@ RELEASED_STREET = replace(
     STREET,
     about="CityGaussianV2 as in its released code for the streets of MatrixCity: 20 blocks of equally many points",
     primitive=Surfel2D(sh_degree=2),
-    pretrain=replace(STREET.pretrain, signal=RELEASED_SIGNAL),
+    pretrain=replace(STREET.pretrain, signal=RELEASED_SIGNAL, appearance=None),
     partition=QuantileGrid(blocks=(5, 4)),
-    tune=replace(STREET.tune, losses=released_depth(STREET, 0.025), signal=RELEASED_SIGNAL),
+    tune=replace(STREET.tune, losses=released_depth(STREET, 0.025), signal=RELEASED_SIGNAL, appearance=None),
     context="densified",
     compress=Vectree(),
 )

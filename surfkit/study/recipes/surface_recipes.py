@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from surfkit.appearance.camera_response import CameraResponse
 from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
@@ -70,6 +71,7 @@ SURFACE = Recipe(
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
         rates=SURFACE_RATES,
         optimizer=AdamInView(),
+        appearance=CameraResponse("uneven"),
     ),
     mesh=SURFACE_MESH,
 )
