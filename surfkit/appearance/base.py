@@ -6,6 +6,7 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
@@ -34,9 +35,16 @@ class Appearance(Component):
     The numbers are learned, or known before training begins: those of a model that `needs_light` begin with what is
     found from the sparse points (`begin_with`), alike in all stages and blocks of a scene. The data set must then tell
     which photographs show which points.
+
+    There may also be numbers that all photographs share, such as the weights of a network (`begin_shared`). They are
+    learned in every step, at the same rate.
+
+    Losses `of_structure` see the colours of the scene as they are, if the model `spares_structure`: what differs from
+    photograph to photograph is then left to the other losses.
     """
 
     needs_light: ClassVar[bool] = False
+    spares_structure: ClassVar[bool] = False
 
     @property
     def only_if_uneven(self) -> bool:
@@ -55,6 +63,10 @@ class Appearance(Component):
         """(V, ...) numbers of photographs whose light is known; of models that `needs_light`."""
         raise NotImplementedError
 
+    def begin_shared(self) -> Tensor:
+        """(S,) numbers that all photographs share, the same ones at each call; none by default."""
+        return torch.zeros(0)
+
     @abstractmethod
     def rate_at(self, index: int, steps: int) -> float:
         """The learning rate in step `index` of 1..`steps`; 0 throughout where the numbers stay as they begin."""
@@ -64,7 +76,8 @@ class Appearance(Component):
         """(3, H, W) colours as the photograph shows them.
 
         Args:
-            numbers: Its own. The result is differentiable in them, where they are learned.
+            numbers: Its own; of a model that has shared ones (E + S,), its own in one row, and then these. The result
+                is differentiable in them, where they are learned.
             color: (3, H, W) of the scene. The result is differentiable in them.
             camera: That took it: which pixel lies where on the sensor.
         """
@@ -72,3 +85,14 @@ class Appearance(Component):
     @abstractmethod
     def folded(self, numbers: Tensor, params: Columns) -> Columns:
         """Raw parameters of the points whose colours are those of the mean photograph."""
+
+
+def joined(numbers: Tensor, shared: Tensor) -> Tensor:
+    """What an appearance model is called with: the numbers of a photograph, (...), as they are, or, where there are
+    shared ones, (E + S,).
+
+    Args:
+        numbers: (...) of the photograph, E in all.
+        shared: (S,) of all photographs, may be none.
+    """
+    return torch.cat([numbers.flatten(), shared]) if len(shared) else numbers

@@ -83,13 +83,16 @@ class Loss(Component):
     priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
     may still be without one, and a data set without normals. `scale_band` says which of them are aligned well enough:
     the lowest and highest multiple of the median scale of all; None for a term that learns no depth. A second view is
-    only chosen and rendered in steps in which a term with a weight has `needs_neighbour`, once for all of them.
+    only chosen and rendered in steps in which a term with a weight has `needs_neighbour`, once for all of them. A term
+    `of_structure` compares colours with those around them, and says little of how bright a photograph is as a whole:
+    some appearance models (`spares_structure`) leave the colours that it sees as they are.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)
     needs_prior: ClassVar[bool] = False
     needs_neighbour: ClassVar[bool] = False
     needs_normals: ClassVar[bool] = False
+    of_structure: ClassVar[bool] = False
     scale_band: tuple[float, float] | None = None
 
     @abstractmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -28,6 +29,8 @@ class L1(Loss):
 @dataclass(frozen=True)
 class SSIM(Loss):
     """One minus the structural similarity with the photograph (11 x 11 window, sigma 1.5)."""
+
+    of_structure: ClassVar[bool] = True
 
     weight: float = 0.2
     """Loss weight."""

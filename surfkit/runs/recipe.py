@@ -249,6 +249,13 @@ def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
         )
     if stage.appearance is not None:
         stage.appearance.refuse_unfit(primitive)
+        used = {name for index in (1, (stage.steps + 1) // 2, stage.steps) for name in stage.weights_at(index)}
+        if stage.appearance.spares_structure and not any(stage.losses[name].of_structure for name in used):
+            raise BadInput(
+                f"{path}.appearance: {name_of(stage.appearance)} leaves the colours of the scene to losses of "
+                f"structure, and only {', '.join(sorted(used))} count; add {path}.losses.ssim:ssim, or choose another "
+                f"appearance"
+            )
 
 
 def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from surfkit.appearance.base import Appearance, PhotoLight
+from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput
@@ -127,7 +127,8 @@ def _check_number(what: str, value: Tensor, leaves: Mapping[str, Tensor]) -> Non
 def check_appearance(appearance: Appearance) -> None:
     """An appearance model begins with numbers that change nothing, gives finite colours that are differentiable in
     colours and, if it learns them, in numbers, learns at a rate of 0 or more, and folds its mean into points of the
-    same columns. One that needs the light of photographs begins with it: no change of light is no change of colours.
+    same columns. So it is with numbers that all photographs share, if there are any. A model that needs the light of
+    photographs begins with it: no change of light is no change of colours.
 
     Args:
         appearance: To check.
@@ -141,18 +142,25 @@ def check_appearance(appearance: Appearance) -> None:
     assert len(numbers) == 5, f"{name}.begin(5) has {len(numbers)} rows"
     assert torch.isfinite(numbers).all(), f"{name}.begin is not finite"
     assert_same(f"{name}.begin", numbers, appearance.begin(5), DETERMINISM_HINT)
+    shared = appearance.begin_shared()
+    assert shared.dim() == 1, f"{name}.begin_shared has shape {tuple(shared.shape)}, not (S,)"
+    assert torch.isfinite(shared).all(), f"{name}.begin_shared is not finite"
+    assert_same(f"{name}.begin_shared", shared, appearance.begin_shared(), DETERMINISM_HINT)
     if appearance.needs_light:
         none = PhotoLight(torch.zeros(5, STOPS), torch.zeros(5, OF_CAMERA))
         assert_same(f"{name}.begin_with, of light that did not change,", numbers, appearance.begin_with(none), "")
     for at, row in enumerate(numbers):
-        same = torch.allclose(appearance(row, color, camera), color, atol=1e-5)
+        same = torch.allclose(appearance(joined(row, shared), color, camera), color, atol=1e-5)
         assert same, f"{name}: the numbers that photograph {at} begins with change its colours"
-    moved = (numbers[0] + 0.1 * torch.randn(numbers[0].shape, generator=draw)).requires_grad_()
-    with unchanged(name, numbers=moved, color=color):
-        shown = appearance(moved, color.requires_grad_(), camera)
+    moved, common = (
+        (value + 0.1 * torch.randn(value.shape, generator=draw)).requires_grad_() for value in (numbers[0], shared)
+    )
+    with unchanged(name, numbers=moved, shared=common, color=color):
+        shown = appearance(joined(moved, common), color.requires_grad_(), camera)
     assert shown.shape == color.shape, f"{name} gives colours of shape {tuple(shown.shape)}, not {tuple(color.shape)}"
     assert torch.isfinite(shown).all(), f"{name} gives colours that are not finite"
     leaves = {"colours": color} | ({"numbers": moved} if any(rates) else {})
+    leaves |= {"shared numbers": common} if len(shared) else {}
     for what, leaf in leaves.items():
         grad = torch.autograd.grad(shown.square().sum(), leaf, retain_graph=True, allow_unused=True)[0]
         assert grad is not None and grad.any(), f"{name} gives no gradient by the {what}"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 
 import torch
 from torch import Tensor
 
-from surfkit.appearance.base import Appearance, PhotoLight
+from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.primitives.points import Columns
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
@@ -17,18 +17,22 @@ from surfkit.train.state import StageState
 
 
 def first_appearances(model: Appearance, count: int, light: PhotoLight | None) -> Columns:
-    """The table of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often. It is empty
-    where the model needs to know their light and there is none: their colours stay as they are."""
+    """The table of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often. Where all
+    share some numbers, (S,), also "shared" with "shared_first" and "shared_second". It is empty where the model needs
+    to know their light and there is none: their colours stay as they are."""
     if light is None and model.needs_light:
         return {}
-    value = model.begin(count) if light is None else model.begin_with(light)
-    moments = {name: torch.zeros_like(value) for name in ("first", "second")}
-    return {"value": value, **moments, "shown": torch.zeros(len(value), dtype=torch.int64)}
+    value, shared = model.begin(count) if light is None else model.begin_with(light), model.begin_shared()
+    table = {"value": value, "first": torch.zeros_like(value), "second": torch.zeros_like(value)}
+    if len(shared):
+        moments = {f"shared_{name}": torch.zeros_like(shared) for name in ("first", "second")}
+        table |= {"shared": shared, **moments}
+    return table | {"shown": torch.zeros(count, dtype=torch.int64)}
 
 
 @dataclass
 class ImageAppearance:
-    """One photograph's own numbers in one step.
+    """One photograph's own numbers in one step, and those that it shares with all others.
 
     Attributes:
         model: What they mean.
@@ -36,8 +40,8 @@ class ImageAppearance:
         row: The photograph's.
         rate: The learning rate now.
         camera: That took it.
-        numbers: The photograph's, with which gradients can be taken.
-        grad: The gradient by them; None before `backward`, and where no loss looks at colours.
+        leaves: The photograph's numbers and, if there are any, the shared ones, by which gradients can be taken.
+        grads: The gradients by them; None where no loss looks at colours that they change.
     """
 
     model: Appearance
@@ -45,11 +49,13 @@ class ImageAppearance:
     row: int
     rate: float
     camera: Camera
-    numbers: Tensor = field(init=False)
-    grad: Tensor | None = field(init=False, default=None)
+    leaves: list[Tensor] = field(init=False)
+    grads: list[Tensor | None] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.numbers = self.table["value"][self.row].clone().requires_grad_()
+        found = [self.table["value"][self.row], *([self.table["shared"]] if "shared" in self.table else [])]
+        self.leaves = [value.clone().requires_grad_() for value in found]
+        self.grads = [None] * len(found)
 
     @classmethod
     def of_step(cls, stage: Stage, state: StageState, at: int, camera: Camera) -> ImageAppearance | None:
@@ -61,19 +67,24 @@ class ImageAppearance:
 
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
-        return self.model(self.numbers.to(color), color, self.camera)
+        own, *shared = (leaf.to(color) for leaf in self.leaves)
+        return self.model(joined(own, *shared) if shared else own, color, self.camera)
 
-    def backward(self, losses: list[Tensor]) -> None:
-        """Find the gradient of the sum of losses, scalars whose graph stays."""
-        if losses:
-            self.grad = torch.autograd.grad(
-                reduce(torch.add, losses), self.numbers, retain_graph=True, allow_unused=True
-            )[0]
+    def add(self, grads: Sequence[Tensor | None]) -> None:
+        """Add gradients by `leaves`, those of some of the losses."""
+        both = zip(self.grads, grads, strict=True)
+        self.grads = [b if a is None else a if b is None else a + b for a, b in both]
 
     def learn(self) -> None:
-        """Take this photograph's next step of Adam, if there is a gradient."""
-        if self.grad is None:
+        """Take the next step of Adam, this photograph's and that of the shared numbers, if there is a gradient."""
+        own, *shared = self.grads
+        if own is None:
             return
-        self.table["shown"][self.row] += 1
+        shown = self.table["shown"]
+        shown[self.row] += 1
         value, first, second = (self.table[name][self.row] for name in ("value", "first", "second"))
-        update(value, self.grad, first, second, self.rate, int(self.table["shown"][self.row]))
+        update(value, own, first, second, self.rate, int(shown[self.row]))
+        for grad in shared:
+            assert grad is not None, "what changes colours by a photograph's numbers does so by the shared ones"
+            value, first, second = (self.table[name] for name in ("shared", "shared_first", "shared_second"))
+            update(value, grad, first, second, self.rate, int(shown.sum()))

@@ -17,20 +17,24 @@ from surfkit.raster.api import Gradients, Maps, Splats
 from surfkit.train.image_appearance import ImageAppearance
 
 
-def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
+def gradient(
+    losses: list[Tensor], leaves: Columns, appearance: ImageAppearance | None = None, shared: bool = False
+) -> Maps:
     """d(sum of losses)/d(maps), shapes of `Maps`; None for a map without influence, but colour is always there.
 
     Args:
         losses: Scalars.
         leaves: The maps by name, (C, H, W) or (H, W).
+        appearance: Is given its own gradient; both come from one pass, as a network on the way costs much of it.
         shared: Other losses have part of their graph in common with these, and come later.
     """
     grads: Sequence[Tensor | None] = [None] * len(leaves)
     if losses:
-        grads = torch.autograd.grad(
-            reduce(torch.add, losses), list(leaves.values()), allow_unused=True, retain_graph=shared
-        )
-    found = Maps(**dict(zip(leaves, grads, strict=True)))
+        by = [*leaves.values(), *(appearance.leaves if appearance is not None else [])]
+        grads = torch.autograd.grad(reduce(torch.add, losses), by, allow_unused=True, retain_graph=shared)
+        if appearance is not None:
+            appearance.add(grads[len(leaves) :])
+    found = Maps(**dict(zip(leaves, grads[: len(leaves)], strict=True)))
     return found if found.color is not None else replace(found, color=torch.zeros_like(leaves["color"]))
 
 
@@ -52,23 +56,26 @@ def loss_gradients(
 ) -> tuple[dict[str, float], Maps, Maps | None]:
     """The weighted losses; their gradient by the maps, and that of those that `Signal.terms` names.
 
-    The appearance finds its own gradient.
+    The appearance is given its own gradient.
     """
     terms = signal.terms
     leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
     leafy = Maps(**leaves)
-    compared = leafy if appearance is None else replace(leafy, color=appearance.shown(leafy.need("color")))
-    compared, target = ignoring(compared, target)
-    values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
+    shown = leafy if appearance is None else replace(leafy, color=appearance.shown(leafy.need("color")))
+    changed = plain = ignoring(shown, target)
+    if appearance is not None and appearance.model.spares_structure:
+        plain = ignoring(leafy, target)  # hidden pixels of the photograph are then those of the scene as it is
+    values = {
+        name: weight * losses[name](*(plain if losses[name].of_structure else changed))
+        for name, weight in active.items()
+    }
     numbers = as_numbers(values)
-    if appearance is not None:
-        appearance.backward(list(values.values()))
     if terms is None:
-        total = gradient(list(values.values()), leaves)
+        total = gradient(list(values.values()), leaves, appearance)
         return numbers, total, total if signal.absolute else None
     shared = appearance is not None or target.mask is not None  # what shows or hides pixels is before all losses
-    chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
-    others = gradient([value for name, value in values.items() if name not in terms], leaves)
+    chosen = gradient([value for name, value in values.items() if name in terms], leaves, appearance, shared)
+    others = gradient([value for name, value in values.items() if name not in terms], leaves, appearance)
     return numbers, added(chosen, others), chosen
 
 

@@ -203,6 +203,26 @@ class Loses(Exposure):
         return {"sh0": params["sh0"]}
 
 
+class Shares(Exposure):
+    """Its shared numbers change nothing."""
+
+    def begin_shared(self):
+        return torch.zeros(2)
+
+    def __call__(self, numbers, color, camera):
+        return Exposure.__call__(self, numbers[:12].view(3, 4), color, camera)
+
+
+class Wanders(Shares):
+    def begin_shared(self):
+        return torch.rand(2)
+
+
+class Folds(Shares):
+    def begin_shared(self):
+        return torch.zeros(1, 2)
+
+
 @pytest.mark.parametrize(
     ("appearance", "message"),
     [
@@ -212,6 +232,9 @@ class Loses(Exposure):
         (Starts(), "Starts.begin_with, of light that did not change"),
         (Reverses(), "Reverses: .* -0.00.*0 or more"),
         (Spills(), r"Spills.folded changed .*params\['sh0'\]"),
+        (Shares(), "Shares gives no gradient by the shared numbers"),
+        (Wanders(), "Wanders.begin_shared"),
+        (Folds(), r"Folds.begin_shared has shape \(1, 2\), not \(S,\)"),
         (Loses(), "Loses.folded gives columns of shapes {'sh0'"),
     ],
 )
