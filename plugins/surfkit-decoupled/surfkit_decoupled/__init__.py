@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from surfkit.plugin import Component, hookimpl
+from surfkit.plugin import Component, Row, hookimpl
 from surfkit_decoupled.appearance import Decoupled
 
 
@@ -12,3 +12,9 @@ from surfkit_decoupled.appearance import Decoupled
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Its part, by the name that recipes use."""
     return {"decoupled": Decoupled}
+
+
+@hookimpl
+def surfkit_rows() -> Mapping[str, tuple[Row, ...]]:
+    """A row of the comparison of appearances."""
+    return {"appearance": (Row("decoupled (VastGaussian)", {"pretrain.appearance": Decoupled()}, kept=False),)}
