@@ -66,6 +66,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.losses.transients import Transients
 from surfkit.losses.warped_patches import WarpedPatches
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.isosurface import isosurface
@@ -242,6 +243,7 @@ __all__ = [
     "Target",
     "Tile",
     "Tracks",
+    "Transients",
     "Trust",
     "View",
     "ViewStatistics",

@@ -11,6 +11,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.losses.transients import Robust
 from surfkit.losses.warped_patches import WarpedPatches
 
 
@@ -28,4 +29,5 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "mean-opacity": MeanOpacity,
         "mean-scale": MeanScale,
         "consensus": Consensus,
+        "robust": Robust,
     }

@@ -10,7 +10,13 @@ from surfkit.testing.data_sets import check_depth_layout, check_split
 from surfkit.testing.executors import check_executor
 from surfkit.testing.feature_checks import check_feature_extractor, check_feature_matcher
 from surfkit.testing.format_checks import check_format
-from surfkit.testing.image_part_checks import check_appearance, check_depth_estimator, check_loss, check_regularizer
+from surfkit.testing.image_part_checks import (
+    check_appearance,
+    check_depth_estimator,
+    check_loss,
+    check_regularizer,
+    check_transients,
+)
 from surfkit.testing.levels import check_levels_of_detail
 from surfkit.testing.method_checks import check_method
 from surfkit.testing.optimizer_checks import check_optimizer
@@ -57,5 +63,6 @@ __all__ = [
     "check_signal",
     "check_split",
     "check_start",
+    "check_transients",
     "check_trust",
 ]

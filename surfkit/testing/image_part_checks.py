@@ -1,4 +1,4 @@
-"""Checks of what looks at photographs: losses, regularizers, appearance models and estimators of depth.
+"""Checks of what looks at photographs: losses, regularizers, transients, appearance models, estimators of depth.
 
 Each check returns nothing and raises AssertionError with a sentence that says what is wrong.
 """
@@ -18,7 +18,8 @@ from torch.nn.functional import interpolate
 from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.losses.base import Loss, Regularizer, RegularizerInput
+from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target
+from surfkit.losses.transients import Transients
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
@@ -122,6 +123,39 @@ def _check_number(what: str, value: Tensor, leaves: Mapping[str, Tensor]) -> Non
     assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
     assert torch.isfinite(value), f"{what} is {value.item()}"
     _check_gradients(what, value, leaves)
+
+
+def check_transients(transients: Transients, size: tuple[int, int] = (24, 32)) -> None:
+    """What finds transients says of each pixel whether it is kept, or nothing, at any step, also where nothing was
+    rendered and where a mask covers some or all of the photograph; it says the same again, whatever it was asked in
+    between, and changes none of its inputs.
+
+    Args:
+        transients: To check, with settings that leave something out of a photograph of something else.
+        size: (H, W) pixels of the pictures it is given.
+    """
+    name, draw = type(transients).__name__, torch.Generator().manual_seed(0)
+    given, render = target(size, draw), torch.rand(3, *size, generator=draw)
+    cases: dict[str, tuple[Tensor, Target]] = {
+        "": (render, given),
+        " of an empty render": (torch.zeros(3, *size), given),
+        " with a mask": (render, replace(given, mask=torch.rand(size, generator=draw) > 0.5)),
+        " with a mask that covers all": (render, replace(given, mask=torch.zeros(size, dtype=torch.bool))),
+    }
+    steps = [(1, 1_000), (500, 1_000), (30_000, 30_000)]
+    found = {}
+    for what, (color, about) in cases.items():
+        for at in steps:
+            with unchanged(name, color=color, target=about):
+                kept = transients.kept(color, about, *at)
+            if kept is not None:
+                assert kept.shape == size, f"{name}{what} gives shape {tuple(kept.shape)}, not {size}"
+                assert kept.dtype == torch.bool, f"{name}{what} gives {kept.dtype}, not bool"
+            found[what, at] = kept
+    assert any(kept is not None for kept in found.values()), f"{name} says nothing at any step"
+    for (what, at), kept in found.items():
+        again = twin(transients).kept(*cases[what], *at)
+        assert_same(f"{name}.kept{what}", kept, again, "a resumed run would differ; keep nothing from step to step")
 
 
 def check_appearance(appearance: Appearance) -> None:

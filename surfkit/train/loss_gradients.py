@@ -15,6 +15,7 @@ from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ign
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Maps, Splats
 from surfkit.train.image_appearance import ImageAppearance
+from surfkit.train.stage import Stage
 
 
 def gradient(
@@ -44,6 +45,21 @@ def added(a: Maps, b: Maps) -> Maps:
     for name, value in b.present().items():
         sums[name] = sums[name] + value if name in sums else value
     return Maps(**sums)
+
+
+@torch.no_grad()
+def without_transients(
+    stage: Stage, index: int, maps: Maps, target: Target, appearance: ImageAppearance | None
+) -> Target:
+    """The target of step `index`, whose mask also covers what passes; all terms and statistics see this one."""
+    if stage.transients is None:
+        return target
+    color = maps.need("color")
+    shown = color if appearance is None else appearance.shown(color)
+    kept = stage.transients.kept(shown, target, index, stage.steps)
+    if kept is None:
+        return target
+    return replace(target, mask=kept if target.mask is None else target.mask & kept)
 
 
 def loss_gradients(

@@ -15,6 +15,7 @@ from surfkit.densify.base import Densify, Policy, Prune, Signal
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.transients import Transients
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 from surfkit.train.adam import Adam
@@ -40,6 +41,9 @@ class Stage:
 
     appearance: Annotated[Appearance | None, choice(Appearance, optional=True)] = None
     """What may differ from photograph to photograph; none takes all colours as they are."""
+
+    transients: Annotated[Transients | None, choice(Transients, optional=True)] = None
+    """How people and cars that move are found, which no loss is to learn; none takes all that photographs show."""
 
     signal: Annotated[Signal, choice(Signal)] = LossGradient()
     """Which gradient drives densification."""

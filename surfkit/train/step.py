@@ -16,7 +16,7 @@ from surfkit.primitives.edit import Edit, apply_in_place, fitted, observe
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
-from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms
+from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms, without_transients
 from surfkit.train.next_view import neighbour, next_target
 from surfkit.train.optimizer import OptimizerInput
 from surfkit.train.point_blocks import spatial_order
@@ -47,6 +47,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     # Losses: the maps are compared with the photograph, and with a second view where a loss wants one.
     second = neighbour(setup, state, splats, at, render.maps) if stage.is_paired(index) else None
     appearance = ImageAppearance.of_step(stage, state, at, camera)
+    target = without_transients(stage, index, render.maps, target, appearance)
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
 

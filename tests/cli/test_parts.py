@@ -16,6 +16,7 @@ from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1
 from surfkit.losses.regularizers import MeanOpacity
 from surfkit.losses.surface import Distortion
+from surfkit.losses.transients import Transients
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.base import Primitive
 from surfkit.train.optimizer import Optimizer
@@ -95,6 +96,7 @@ SLOTS = {
     Loss: "pretrain.losses.extra",
     Regularizer: "pretrain.regularizers.extra",
     Appearance: "pretrain.appearance",
+    Transients: "pretrain.transients",
     Signal: "pretrain.signal",
     Optimizer: "pretrain.optimizer",
     Densify: "pretrain.densify",

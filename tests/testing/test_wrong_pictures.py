@@ -9,7 +9,14 @@ import torch
 from surfkit.appearance import CameraResponse, Exposure
 from surfkit.depth.base import DepthEstimator, Estimate
 from surfkit.losses.base import Loss, Regularizer
-from surfkit.testing import check_appearance, check_depth_estimator, check_loss, check_regularizer
+from surfkit.losses.transients import Robust, Transients
+from surfkit.testing import (
+    check_appearance,
+    check_depth_estimator,
+    check_loss,
+    check_regularizer,
+    check_transients,
+)
 from surfkit.testing.inputs import survey
 
 
@@ -242,6 +249,65 @@ def test_appearance_models_that_are_wrong(appearance, message):
     check_appearance(Exposure())
     with pytest.raises(AssertionError, match=message):
         check_appearance(appearance)
+
+
+@dataclass(frozen=True)
+class Far(Transients):
+    """Colours that are far off."""
+
+    def kept(self, color, target, index, steps):
+        return (color - target.photo).abs().sum(0) < 1
+
+
+class PerChannel(Far):
+    def kept(self, color, target, index, steps):
+        return (color - target.photo).abs() < 0.5
+
+
+class Weighs(Far):
+    def kept(self, color, target, index, steps):
+        return (color - target.photo).abs().sum(0)
+
+
+class Never(Far):
+    def kept(self, color, target, index, steps):
+        return None
+
+
+class Draws(Far):
+    def kept(self, color, target, index, steps):
+        return torch.rand(color.shape[1:]) > 0.5
+
+
+class Doubles(Far):
+    def kept(self, color, target, index, steps):
+        return super().kept(color.mul_(2), target, index, steps)
+
+
+class Recalls(Far):
+    seen: ClassVar[list] = []
+
+    def kept(self, color, target, index, steps):
+        self.seen.append(index)
+        return super().kept(color, target, index, steps) if len(self.seen) < 15 else None
+
+
+@pytest.mark.parametrize(
+    ("transients", "message"),
+    [
+        (PerChannel(), r"PerChannel gives shape \(3, 24, 32\), not \(24, 32\)"),
+        (Weighs(), "Weighs gives torch.float32, not bool"),
+        (Never(), "Never says nothing at any step"),
+        (Draws(), "Draws.kept is not repeatable.*keep nothing"),
+        (Doubles(), "Doubles changed its input color"),
+        (Recalls(), "Recalls.kept .*is not repeatable"),
+    ],
+)
+def test_transients_that_are_wrong(transients, message):
+    check_transients(Far())
+    check_transients(Robust(radius_px=2))
+    with pytest.raises(AssertionError, match=message):
+        check_transients(transients)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.losses.transients import Transients
 from surfkit.primitives.base import Primitive
 from surfkit.raster.cuda.gpu import CudaRasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
@@ -134,7 +135,7 @@ def test_a_step_leaves_nothing_on_the_gpu(tiny, begin, optimizer):
 
 PARTS = [
     (kind, name)
-    for kind in (Loss, Regularizer, Densify, Filter, Prune, Signal, Appearance, Optimizer, Primitive)
+    for kind in (Loss, Regularizer, Densify, Filter, Prune, Signal, Appearance, Transients, Optimizer, Primitive)
     for name, cls in components(kind).items()
     if cls.__module__.startswith("surfkit.")
 ]
@@ -164,6 +165,7 @@ def staged(kind, name):
         changes = {
             Regularizer: {"regularizers": {"it": part}},
             Appearance: {"appearance": part},
+            Transients: {"transients": part},
             Optimizer: {"optimizer": part},
             Signal: {"signal": part, "densify": edits},
             Filter: {"densify": replace(edits, filters=(part,))},
