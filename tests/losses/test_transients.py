@@ -15,7 +15,7 @@ from surfkit.losses.base import ignoring
 from surfkit.losses.transients import Transients, inliers_of, kept_areas
 from surfkit.raster.api import Maps
 from surfkit.testing import inputs
-from surfkit.train.image_appearance import ImageAppearance, fresh_appearances
+from surfkit.train.image_appearance import ImageAppearance, first_appearances
 from surfkit.train.loss_gradients import loss_gradients, without_transients
 from surfkit.train.stage import Stage
 
@@ -108,7 +108,7 @@ def test_masks_are_joined_and_colours_are_those_of_the_photograph():
     color, target = with_a_box()
     upper = torch.arange(SIZE[0])[:, None].expand(SIZE) < 30
     stage = Stage(transients=LeftHalf(), appearance=Exposure())
-    table = fresh_appearances(stage.appearance.begin(1))
+    table = first_appearances(stage.appearance, 1, None)
     table["value"] += 0.1
     light = ImageAppearance(stage.appearance, table, 0, 0.0, target.view.camera)
     mask = without_transients(stage, 1, Maps(color=color), replace(target, mask=upper), light).mask
