@@ -30,8 +30,8 @@ class Decoupled(Appearance):
     shuffle, which doubles the size, and a convolution; then bilinear doubling and two convolutions at full size. All
     are 3 x 3, with a ReLU but after the last. The photograph is compared with I^a = M * I^r (VastGaussian, sec. 4.2).
 
-    M is 1 + what the last convolution gives, whose weights begin as zeros: at first nothing changes. Embeddings, and the
-    other weights as He et al. (2015) have it, begin as fixed random numbers.
+    M is 1 + what the last convolution gives, whose weights begin as zeros: at first nothing changes. Embeddings, and
+    the other weights as He et al. (2015) have it, begin as fixed random numbers.
 
     Losses of structure, such as `ssim`, see I^r, all others I^a. So D-SSIM holds structure and colours of the scene,
     and L1 tells what is left. A stage without any loss of structure is refused.

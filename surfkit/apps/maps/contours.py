@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import struct
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from surfkit.apps.maps.geotiff import TILES_SUFFIX, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
+from surfkit.apps.maps.joined_lines import Line, joined, length_of
 from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
@@ -21,6 +22,8 @@ AUTO_LEVELS = 20
 """About how many levels an automatic interval gives."""
 MAX_CONTOUR_LEVELS = 10_000
 """Of a map."""
+LINES_TOGETHER = 10_000
+"""Lines that are written at once."""
 WKB_LINESTRING = 2
 """LineString in well-known binary."""
 
@@ -32,24 +35,26 @@ def even_interval(lowest: float, highest: float) -> float:
     return float(f"{next(step * power for step in (1, 2, 5, 10) if step * power >= least * (1 - 1e-9)):.1g}")
 
 
-def write_contours(sheet: GeoTiffSettings, heights: str, name: str, interval: float, side: int) -> int:
-    """Write the contour lines of a surface model of `sheet.out`, and return how many there are.
+def write_contours(
+    sheet: GeoTiffSettings, heights: str, name: str, interval: float, least: float, side: int
+) -> tuple[int, int]:
+    """Write the contour lines of a surface model of `sheet.out`; how many there are, and how many were too short.
 
-    Lines are cut where tiles meet, and their ends are the same there to the last bit. They end where there is no
-    surface.
+    They are traced tile by tile, put together where tiles meet, and end where there is no surface.
 
     Args:
         sheet: Where.
         heights: File name of the surface model.
         name: File name of the GeoPackage: a layer `contours` with a field `elevation`.
         interval: Between levels, units of the input; levels are its multiples.
+        least: Shorter lines are left out, units of the input.
         side: Of a tile, cells.
     """
     with needed("pyogrio", "contour lines"):
-        from pyogrio.raw import write
+        import pyogrio  # noqa: F401 (before anything is traced)
     import rasterio
 
-    grid, path, count = sheet.grid, sheet.folder / name, 0
+    grid, path, count, short = sheet.grid, sheet.folder / name, 0, 0
     windows, tiles = list(grid.tiles(side)), sheet.folder / f"{name}{TILES_SUFFIX}"
     tiles.mkdir(exist_ok=True)
     with rasterio.open(sheet.out / heights) as model:
@@ -66,19 +71,32 @@ def write_contours(sheet: GeoTiffSettings, heights: str, name: str, interval: fl
     for rest in sheet.folder.glob(f"{name}*"):
         if rest != tiles:  # of an interrupted call
             rest.unlink()
-    for at in range(len(windows)):
-        lines = _kept(tiles / f"{at}.npz")
-        if lines or not path.exists():
-            shapes = np.array([_binary(line) for _, line in lines], object)
-            levels = np.array([level for level, _ in lines], np.float64)
-            write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
-        count += len(lines)
-        emit(Progress("writing contour lines", at + 1, len(windows)))
+    few: list[Line] = []
+    traced = joined(len(windows), lambda at: _kept(tiles / f"{at}.npz"))
+    for found in traced:
+        long = [line for line in found if length_of(line[1]) >= least]
+        short += len(found) - len(long)
+        few += long
+        if len(few) >= LINES_TOGETHER:
+            count += _append(few, path, layer)
+            few = []
+    if few or not path.exists():
+        count += _append(few, path, layer)
     sheet.deliver(path)
-    return count
+    return count, short
 
 
-def _keep(lines: list[tuple[float, np.ndarray]], path: Path) -> None:
+def _append(lines: list[Line], path: Path, layer: dict[str, Any]) -> int:
+    """Write lines to those of a file, and return how many they are."""
+    from pyogrio.raw import write
+
+    shapes = np.array([_binary(line) for _, line in lines], object)
+    levels = np.array([level for level, _ in lines], np.float64)
+    write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
+    return len(lines)
+
+
+def _keep(lines: list[Line], path: Path) -> None:
     """Keep the levels and lines of a tile."""
     levels, places = [level for level, _ in lines], [line for _, line in lines]
     with replacing(path) as file:
@@ -88,16 +106,14 @@ def _keep(lines: list[tuple[float, np.ndarray]], path: Path) -> None:
         )
 
 
-def _kept(path: Path) -> list[tuple[float, np.ndarray]]:
+def _kept(path: Path) -> list[Line]:
     """What was kept."""
     with np.load(path) as found:
         lines = np.split(found["places"], found["ends"])[:-1]
         return list(zip(found["levels"].tolist(), lines, strict=True))
 
 
-def contour_lines(
-    heights: np.ndarray, grid: MapGrid, window: Window, interval: float
-) -> list[tuple[float, np.ndarray]]:
+def contour_lines(heights: np.ndarray, grid: MapGrid, window: Window, interval: float) -> list[Line]:
     """Levels and lines, (n, 2) float64 easting and northing, of the heights at the centres of a window of cells.
 
     Between centres heights are linear along the sides of the squares of four of them, as in all programs.

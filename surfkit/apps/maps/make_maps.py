@@ -38,6 +38,8 @@ Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
 COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
+SHORTEST_CELLS = 50
+"""Length of the shortest contour line that is written without being asked for others, cells."""
 PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 """What products need beside rasterio."""
 
@@ -59,6 +61,10 @@ class MapSettings:
     interval: Length = "auto"
     """Between contour lines, like --gsd. `auto` is 1, 2 or 5 times a power of ten that gives at most 20 levels."""
 
+    shortest: Length = "auto"
+    """Length of the shortest contour line that is written, like --gsd, or 0 for all: crumbs on trees and at edges are
+    shorter. `auto` is 50 cells; how many were left out is printed."""
+
     spacing: Length = "auto"
     """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is that
     of --gsd."""
@@ -67,8 +73,8 @@ class MapSettings:
     """Axis of the data set that points up. Default: z if it is georeferenced, else what the cameras tell."""
 
     tile: int = 2048
-    """Side of the tiles that are drawn at once, pixels. Rasters do not depend on it; contour lines are cut where tiles
-    meet."""
+    """Side of the tiles that are drawn at once, pixels. Maps do not depend on it, but for the order of contour lines
+    and the place where closed ones begin."""
 
     colors: Literal["photographs", "mesh"] = "mesh"
     """Of the orthophoto: those of the photographs, one for each place, or those of the vertices of the mesh, which are
@@ -81,6 +87,8 @@ class MapSettings:
         cache_bytes(self.memory, "--memory")
         if self.colors == "photographs" and "orthophoto" not in self.products:
             raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
+        if self.shortest != "auto" and not 0 <= self.shortest < float("inf"):
+            raise BadInput(f"--shortest {self.shortest:g}: it is a length, so it must be 0 or more, or auto")
         for name in ("gsd", "interval", "spacing"):
             value = getattr(self, name)
             if value != "auto" and not 0 < value < float("inf"):
@@ -224,7 +232,9 @@ def draw_products(
     if "contours" in done:
         given = settings.interval
         interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
-        record["contours"] = sheet.once([PRODUCT_FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
+        least = SHORTEST_CELLS * sheet.grid.gsd if settings.shortest == "auto" else settings.shortest / units
+        name = PRODUCT_FILES["contours"]
+        record["contours"] = sheet.once([name], lambda: trace(sheet, interval, least, settings.tile))
     if "points" in done:
         spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
         record["points"] = sheet.once([PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
@@ -237,12 +247,10 @@ def shade(sheet: GeoTiffSettings, side: int) -> dict[str, Any]:
     return {}
 
 
-def trace(sheet: GeoTiffSettings, interval: float, side: int) -> dict[str, Any]:
+def trace(sheet: GeoTiffSettings, interval: float, least: float, side: int) -> dict[str, Any]:
     """Write the contour lines, and return what maps.json says of them."""
-    return {
-        "interval": interval,
-        "lines": write_contours(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["contours"], interval, side),
-    }
+    lines, short = write_contours(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["contours"], interval, least, side)
+    return {"interval": interval, "lines": lines, "shortest": least, "too_short": short}
 
 
 def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float) -> dict[str, Any]:

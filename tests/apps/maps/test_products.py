@@ -8,12 +8,14 @@ import pytest
 import torch
 from needs import needs
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from surfkit.apps.maps.cloud import sample_evenly, write_cloud
 from surfkit.apps.maps.contours import contour_lines, even_interval
 from surfkit.apps.maps.difference import write_difference
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.hillshade import hillshade
+from surfkit.apps.maps.joined_lines import joined
 from surfkit.apps.maps.make_maps import MapSettings, make_maps
 from surfkit.apps.maps.map_grid import Window, map_crs, same_crs
 from surfkit.apps.texture.resolution import ground_sampling_distance
@@ -58,6 +60,49 @@ def test_contours_of_a_cone_are_circles_and_meet_where_tiles_do():
         ]
     inner = [end for end in ends if np.hypot(end[1] - UTM[0], end[2] - UTM[1]) < 16]
     assert len(inner) > 10 and all(inner.count(end) == 2 for end in inner)
+
+
+def whole_lines(lines):
+    """Levels and lines, in an order and with beginnings of their own."""
+    found = []
+    for level, line in lines:
+        if (line[0] == line[-1]).all():
+            ring = line[:-1]
+            line = np.roll(ring, -min(range(len(ring)), key=lambda at: tuple(ring[at])), 0)
+        found.append((level, line.tobytes()))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("side", [16, 23])
+def test_lines_are_whole_where_tiles_cut_them(side):
+    """Of rough ground with holes: the same lines as those of the whole map at once, from pieces in any tile."""
+    draw = np.random.default_rng(3)
+    grid = grid_of(1.0, 0, 0, 90, 70)
+    heights = gaussian_filter(draw.normal(size=(70, 90)), 2.5) * 40
+    heights[draw.random((70, 90)) < 0.01] = np.nan
+    whole = contour_lines(heights, grid, Window(0, 0, 90, 70), 2.0)
+    tiles = []
+    for part in grid.tiles(side):
+        window = Window(part.left, part.top, min(side + 1, 90 - part.left), min(side + 1, 70 - part.top))
+        rows, columns = (slice(a, a + b) for a, b in ((window.top, window.height), (window.left, window.width)))
+        tiles.append(contour_lines(heights[rows, columns], grid, window, 2.0))
+    assert sum(map(len, tiles)) > 1.5 * len(whole)
+    assert whole_lines(line for some in joined(len(tiles), tiles.__getitem__) for line in some) == whole_lines(whole)
+
+
+def test_crumbs_are_left_out_and_counted(tmp_path):
+    read = needs("pyogrio.raw").read
+    subject = MeshWithPhotos(heightfield(cone, (UTM[0] - 15, UTM[1] - 15), (UTM[0] + 15, UTM[1] + 15), 40), FRAME)
+    for shortest, least in (("auto", 12.5), (25.0, 25.0), (1_000.0, 1_000.0)):
+        settings = MapSettings(("contours",), gsd=0.25, interval=5.0, shortest=shortest)
+        record = make_maps(subject, settings, tmp_path)["contours"]
+        levels = list(read(tmp_path / "contours.gpkg")[3][0])
+        assert record["shortest"] == least and record["lines"] == len(levels)
+        rings = [level for level in (30, 35) if 2 * np.pi * (40 - level) > least]
+        assert [level for level in levels if level >= 30] == rings and 20 not in levels, "that has arcs in corners"
+        assert record["too_short"] >= 4
+    with pytest.raises(BadInput, match="--shortest -1: it is a length, so it must be 0 or more, or auto"):
+        MapSettings(shortest=-1.0)
 
 
 def test_levels_are_as_people_write_them():
@@ -266,7 +311,8 @@ def test_all_products_of_a_hill(tmp_path):
         return np.tile([[90, 80, 70]], (len(x), 1))
 
     surface = heightfield(cone, (UTM[0] - 15, UTM[1] - 15), (UTM[0] + 15, UTM[1] + 15), 40, color)
-    record = make_maps(MeshWithPhotos(surface, FRAME), MapSettings(gsd=0.25, interval=5.0, tile=50), tmp_path)
+    settings = MapSettings(gsd=0.25, interval=5.0, shortest=0.0, tile=50)
+    record = make_maps(MeshWithPhotos(surface, FRAME), settings, tmp_path)
     assert json.loads((tmp_path / "maps.json").read_text()) == record
     assert record["files"] == ["dsm.tif", "orthophoto.tif", "hillshade.tif", "contours.gpkg", "points.laz"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*record["files"], "maps.json"])
@@ -282,6 +328,7 @@ def test_all_products_of_a_hill(tmp_path):
         assert np.abs(np.hypot(*(places - UTM).T) - (40 - level)).max() < 0.2, "a mesh of steps of 0.8 m"
         lengths[level] += np.hypot(*np.diff(places, axis=0).T).sum()
     for level in (30, 35):
+        assert list(levels).count(level) == 1, "one line, whatever the tiles"
         assert lengths[level] == pytest.approx(2 * np.pi * (40 - level), rel=0.01), "tiles leave no gaps"
     with rasterio.open(tmp_path / "hillshade.tif") as file:
         shade = file.read(1)
