@@ -38,7 +38,7 @@ Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
 COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
-SHORTEST_CELLS = 50
+SHORTEST_CELLS = 30
 """Length of the shortest contour line that is written without being asked for others, cells."""
 PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 """What products need beside rasterio."""
@@ -63,7 +63,7 @@ class MapSettings:
 
     shortest: Length = "auto"
     """Length of the shortest contour line that is written, like --gsd, or 0 for all: crumbs on trees and at edges are
-    shorter. `auto` is 50 cells; how many were left out is printed."""
+    shorter. `auto` is 30 cells; how many were left out is printed."""
 
     spacing: Length = "auto"
     """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is that

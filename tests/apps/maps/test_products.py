@@ -93,7 +93,7 @@ def test_lines_are_whole_where_tiles_cut_them(side):
 def test_crumbs_are_left_out_and_counted(tmp_path):
     read = needs("pyogrio.raw").read
     subject = MeshWithPhotos(heightfield(cone, (UTM[0] - 15, UTM[1] - 15), (UTM[0] + 15, UTM[1] + 15), 40), FRAME)
-    for shortest, least in (("auto", 12.5), (25.0, 25.0), (1_000.0, 1_000.0)):
+    for shortest, least in (("auto", 7.5), (25.0, 25.0), (1_000.0, 1_000.0)):
         settings = MapSettings(("contours",), gsd=0.25, interval=5.0, shortest=shortest)
         record = make_maps(subject, settings, tmp_path)["contours"]
         levels = list(read(tmp_path / "contours.gpkg")[3][0])
