@@ -14,7 +14,7 @@ from scipy import ndimage
 
 OUTLIER_SLOPE = 5.0
 """Slope beside a cell that lies lower than all around it, above which it is an error and not ground (Pingel et al.)."""
-SWEEPS, OVER_RELAXATION = 24, 1.7
+SWEEPS, OVER_RELAXATION = 32, 1.85
 """Of the interpolation, on each level: sweeps, and the factor by which each goes beyond the mean of the neighbours."""
 GROUND, VEGETATION, BUILDING, UNCLASSIFIED = 2, 5, 6, 1
 """Classes of the LAS specification 1.4 (vegetation: high)."""
@@ -22,6 +22,8 @@ LEAST_OBJECT_METRES = 2.0
 """Height above ground from which something is taken for a building or high vegetation."""
 PLANAR_METRES = 0.15
 """Root mean square distance from a plane, over 3 x 3 coarse cells, up to which a surface is that of a roof."""
+LEAST_PLANE_SHARE = 0.25
+"""Share of an object that is plane, from which the rest of it is of a building too."""
 GREEN = 0.08
 """Excess green index, (2 G - R - B) / (R + G + B), from which a surface is green (Woebbecke et al., 1995)."""
 
@@ -57,7 +59,7 @@ def ground_cells(lowest: np.ndarray, cell: float, width: float, slope: float) ->
     surface, base = np.where(ground, lowest, 0.0), ground.copy()
     for radius in range(1, max(1, int(np.ceil(width / 2 / cell))) + 1):
         lower = np.where(base, opened(surface, base, radius), 0.0)
-        ground &= ~(base & (surface - lower > slope * radius * cell))
+        ground &= ~(surface - lower > slope * radius * cell)
         surface = lower
     return ground
 
@@ -148,10 +150,11 @@ def roughness(top: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def classes(above: np.ndarray, rough: np.ndarray, green: np.ndarray | None, metre: float) -> np.ndarray:
     """(H, W) uint8 of what stands on the ground, a guess: BUILDING where a surface is plane and not green, VEGETATION
-    where it is neither, UNCLASSIFIED where it cannot be told; without colours there is no VEGETATION.
+    where it is neither, UNCLASSIFIED where it cannot be told.
 
-    Cells that cannot be told take the class of at least half of the objects in 5 x 5 cells around them: things on
-    roofs are part of the building.
+    Parts of an object that are neither are of the building (walls, chimneys) if at least a quarter of what is not green
+    of that object is plane. Without colours trees beside a house would be taken for a part of it, so there only plane
+    surfaces are BUILDING, and nothing is VEGETATION. Cells at the foot of an object have its class, for its walls.
 
     Args:
         above: (H, W) height above ground, NaN where there is no surface.
@@ -161,16 +164,15 @@ def classes(above: np.ndarray, rough: np.ndarray, green: np.ndarray | None, metr
     """
     with np.errstate(invalid="ignore"):
         stands = above >= LEAST_OBJECT_METRES * metre
-        plane = rough <= PLANAR_METRES * metre
-        leaf = np.zeros(above.shape, bool) if green is None else green > GREEN
-        known = np.ones(above.shape, bool) if green is None else np.isfinite(green)
-    building, vegetation = stands & plane & ~leaf & known, stands & ~plane & leaf
+        plane = stands & (rough <= PLANAR_METRES * metre)
+        leaf = np.zeros(above.shape, bool) if green is None else stands & (green > GREEN)
+    building = ndimage.binary_opening(plane & ~leaf, np.ones((3, 3)))  # a window; not the edge of a tree
+    vegetation = leaf & ~plane
+    if green is not None:
+        objects, count = ndimage.label(stands, np.ones((3, 3)))
+        grey = stands & ~leaf
+        total, planes = (np.bincount(objects[each], minlength=count + 1) for each in (grey, building))
+        building |= grey & (planes >= LEAST_PLANE_SHARE * total)[objects]
     found = np.full(above.shape, UNCLASSIFIED, np.uint8)
-    total, *shares = (
-        ndimage.correlate(each.astype(np.float64), np.ones((5, 5)), mode="constant")
-        for each in (stands, building, vegetation)
-    )
-    for mine, share, name in zip((building, vegetation), shares, (BUILDING, VEGETATION), strict=True):
-        untold = stands & ~building & ~vegetation & (share >= total / 2)
-        found[mine | untold] = name
-    return found
+    found[building], found[vegetation] = BUILDING, VEGETATION
+    return np.where(stands, found, ndimage.maximum_filter(found, 3))

@@ -176,7 +176,7 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
         base = ground_cells(lowest, cell, settings.building_width * metre, settings.slope)
         terrain = fill_smoothly(lowest, base)
         least = max(1, int(LEAST_SHARE * factor**2))
-        tolerance = (settings.height + SLOPE_TOLERANCE * slope_of(terrain, cell)) * metre
+        tolerance = _tolerance(terrain, cell, settings, metre)
         for rows, columns, blocks, window in _blocks(file, grid, factor, "measuring the ground"):
             near = [between_cells(each, factor, *_numbers(window)).reshape(blocks.shape) for each in (terrain, tolerance)]
             with np.errstate(invalid="ignore"):
@@ -187,12 +187,18 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
             "--products terrain: no ground was found; the mesh has too few surfaces, or --terrain.height is too small"
         )
     terrain = fill_smoothly(seen, told)
-    tolerance = (settings.height + SLOPE_TOLERANCE * slope_of(terrain, cell)) * metre
+    tolerance = _tolerance(terrain, cell, settings, metre)
     distance = ndimage.distance_transform_edt(~told) * cell
     green = _green(surface, grid, terrain, factor, metre) if has_colors(surface) else None
     kinds = classes(top - terrain, roughness(top, known), green, metre)
     reach = settings.building_width * metre
     return Ground(factor, terrain, tolerance, distance, ndimage.binary_fill_holes(known), kinds, reach, metre)
+
+
+def _tolerance(terrain: np.ndarray, cell: float, settings: TerrainSettings, metre: float) -> np.ndarray:
+    """(H, W) distance from the ground up to which a surface is ground; steeper than the ground may be counts as that."""
+    slope = slope_of(terrain, cell).clip(max=settings.slope)
+    return (settings.height + SLOPE_TOLERANCE * slope) * metre
 
 
 def _blocks(
