@@ -14,6 +14,8 @@ from scipy import ndimage
 
 OUTLIER_SLOPE = 5.0
 """Slope beside a cell that lies lower than all around it, above which it is an error and not ground (Pingel et al.)."""
+OBJECT_SLOPES = 3.0
+"""Multiple of the slope of the ground, over a whole window, from which something is an object however smooth it is."""
 SWEEPS, OVER_RELAXATION = 32, 1.85
 """Of the interpolation, on each level: sweeps, and the factor by which each goes beyond the mean of the neighbours."""
 GROUND, VEGETATION, BUILDING, UNCLASSIFIED = 2, 5, 6, 1
@@ -59,7 +61,9 @@ def ground_cells(lowest: np.ndarray, cell: float, width: float, slope: float) ->
     surface, base = np.where(ground, lowest, 0.0), ground.copy()
     for radius in range(1, max(1, int(np.ceil(width / 2 / cell))) + 1):
         lower = np.where(base, opened(surface, base, radius), 0.0)
-        ground &= ~(surface - lower > slope * radius * cell)
+        # In all too: walls that a mesh has smoothed go bit by bit, each less than what ground may rise.
+        steep = (surface - lower > slope * radius * cell) | (lowest - lower > OBJECT_SLOPES * slope * radius * cell)
+        ground &= ~steep
         surface = lower
     return ground
 

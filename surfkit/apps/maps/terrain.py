@@ -186,8 +186,12 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
         raise BadInput(
             "--products terrain: no ground was found; the mesh has too few surfaces, or --terrain.height is too small"
         )
-    terrain = fill_smoothly(seen, told)
+    # A mesh smooths the feet of walls and fills gaps between houses: ground is taken from where there is ground around.
+    core = ndimage.binary_erosion(told, np.ones((3, 3)), border_value=True)
+    terrain = fill_smoothly(seen, core if core.any() else told)
     tolerance = _tolerance(terrain, cell, settings, metre)
+    with np.errstate(invalid="ignore"):
+        told = np.abs(seen - terrain) <= tolerance
     distance = ndimage.distance_transform_edt(~told) * cell
     green = _green(surface, grid, terrain, factor, metre) if has_colors(surface) else None
     kinds = classes(top - terrain, roughness(top, known), green, metre)

@@ -149,7 +149,7 @@ def test_ridges_stay(tmp_path):
 
 
 def ridge(x, y):
-    return 60 - 0.5 * np.abs(x - 50)
+    return 60 - 0.4 * np.abs(x - 50)
 
 
 def holed(side):
