@@ -1,9 +1,10 @@
 """The terrain model of maps against the exact terrain of a rendered city, and the classes of its points.
 
-    surfkit maps RUN --products points terrain --metres-per-unit 1 --bounds WEST SOUTH EAST NORTH --out MAPS
-    python bench/terrain.py MAPS TRUTH.ply [NAME]
+    surfkit maps RUN --products points terrain --metres-per-unit 1 --gsd 0.25 --bounds -120 -120 120 120 --out MAPS
+    python bench/terrain.py TRUTH.ply [MAPS]
 
-TRUTH.ply is the exact mesh (shibuya-synth: gt/mesh.ply). Its ground is the triangles with corners on a lattice of 4 m;
+Maps are drawn of the exact mesh, and of its heights smoothed and with noise; maps of a run may be given too. TRUTH.ply
+is the exact mesh (shibuya-synth: gt/mesh.ply, from -120 to 120 m). Its ground is the triangles with corners on a lattice of 4 m;
 it goes on beneath buildings. Ground is seen where it is the highest surface of the exact mesh. Counted are cells within
 20 m of one that is; from these, those on ground that is seen, and those below something. Also counted: the share of
 ground that is seen which the cloud has in class 2, and of the surface 2 m and more above ground which it has not.
@@ -13,6 +14,8 @@ Results go to bench/results/terrain.json. The map is level, z up.
 from __future__ import annotations
 
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +26,19 @@ from holes import read_grid
 from machine import save
 from scipy import ndimage
 
+from surfkit.apps.maps.make_maps import MapSettings, make_maps
 from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.zbuffer import ZBuffer
-from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface
+from surfkit.scene.scene import Frame
 
 LATTICE = 4.0
 """Metres between the corners of the exact ground."""
 SEEN_WITHIN = 20.0
 """Metres to ground that is seen."""
+MAP_SIDE = 240.0
+"""Metres of the map, about 0 0."""
 HIGH = 2.0
 """Metres above ground of what is an object."""
 
@@ -84,9 +92,7 @@ def measured(maps: Path, truth: Path) -> dict[str, float]:
     return figures
 
 
-def classes(
-    path: Path, grid: MapGrid, ground: np.ndarray, surface: np.ndarray, seen: np.ndarray
-) -> dict[str, float]:
+def classes(path: Path, grid: MapGrid, ground: np.ndarray, surface: np.ndarray, seen: np.ndarray) -> dict[str, float]:
     """Shares of classes among points over ground that is seen, and over high objects."""
     points = laspy.read(path)
     column, row, height = grid.to_cells(np.stack([points.x, points.y, points.z], 1)).T
@@ -103,13 +109,40 @@ def classes(
     }
 
 
-def main(maps: Path, truth: Path, name: str = "shibuya-synth") -> None:
+def meshes(truth: Path) -> Iterator[tuple[str, SurfaceFile]]:
+    """The exact mesh, and a mesh of its heights every 0.5 m, smoothed by 0.5 m, with noise of 0.15 m."""
+    yield "exact mesh", read_surface(truth)
+    half = MAP_SIDE / 2
+    grid = MapGrid.around(np.eye(3), 0.5, (-half, -half, half, half))
+    _, surface = exact(truth, grid)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=surface.shape), 1.0)
+    known = np.where(np.isfinite(surface), surface, np.nanmean(surface))
+    heights = ndimage.gaussian_filter(known, 1.0) + noise * 0.15 / noise.std()
+    row, column = np.indices(heights.shape) + 0.5
+    rows = np.zeros(heights.size, [(axis, "<f8") for axis in "xyz"])
+    rows["x"], rows["y"] = ((grid.west + column) / 2).ravel(), ((grid.north - row) / 2).ravel()
+    rows["z"] = heights.ravel()
+    number = np.arange(heights.size).reshape(heights.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate([np.stack(each, -1).reshape(-1, 3) for each in ((a, b, c), (a, c, d))])
+    yield "smoothed, with noise", SurfaceFile(truth, rows, faces)
+
+
+def main(truth: Path, maps: Path | None = None) -> None:
     """Print the figures and keep them."""
-    figures: dict[str, Any] = {f"{name}: {key}": value for key, value in measured(maps, truth).items()}
+    half, figures = MAP_SIDE / 2, dict[str, Any]()
+    settings = MapSettings(("points", "terrain"), 0.25, (-half, -half, half, half), spacing=0.5, up="z")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, mesh in meshes(truth):
+            out = Path(folder) / name.split()[0]
+            make_maps(MeshWithPhotos(mesh, Frame(np.zeros(3), 0.01, 1.0, None)), settings, out)
+            figures |= {f"{name}: {key}": value for key, value in measured(out, truth).items()}
+    if maps is not None:
+        figures |= {f"maps given: {key}": value for key, value in measured(maps, truth).items()}
     for key, value in figures.items():
         print(f"{key}: {value:.4g}")
     save("terrain", figures)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])
+    main(*map(Path, sys.argv[1:]))

@@ -125,7 +125,8 @@ def show(out: Path, record: dict[str, Any]) -> None:
         rows.append(("points", f"{found['points']:,}, one for {found['spacing']:g} x {found['spacing']:g} {unit}"))
     if found := record.get("terrain"):
         rows.append(("ground that is seen", f"{found['ground_seen']:.1%} of the surface"))
-        rows.append(("without terrain", f"{found['without_terrain']:.1%} of it: no ground within {found['reach']:g} {unit}"))
+        told = f"{found['without_terrain']:.1%} of it: no ground within {found['reach']:g} {unit}"
+        rows.append(("without terrain", told))
     if found := record.get("difference"):
         rows += [
             ("above (fill)", f"{found['fill']:,.6g} {unit}³ on {found['area']:,.6g} {unit}² compared"),

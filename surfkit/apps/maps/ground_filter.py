@@ -3,8 +3,8 @@
 The ground filter is the simple morphological filter (SMRF) of Pingel, Clarke and McBride, "An improved simple
 morphological filter for the terrain classification of airborne LIDAR data" (ISPRS Journal 77, 2013): openings of the
 lowest surface with growing windows take away what stands on the ground. Windows are square, as in Zhang et al., "A
-progressive morphological filter" (IEEE TGRS 41, 2003), as these cost the same for all sizes. All functions see the whole
-map on coarse cells, so that there are no borders of tiles.
+progressive morphological filter" (IEEE TGRS 41, 2003), as these cost the same for all sizes. All functions see the
+whole map on coarse cells, so that there are no borders of tiles.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _halved(values: np.ndarray) -> np.ndarray:
 
 
 def between_cells(coarse: np.ndarray, factor: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(n, m) bilinear interpolation of coarse cells at the centres of fine ones, the same whatever the rows and columns.
+    """(n, m) bilinear interpolation of coarse cells at the centres of fine ones, for each the same whatever the others.
 
     Args:
         coarse: (H, W).

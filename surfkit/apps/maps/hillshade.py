@@ -48,7 +48,7 @@ def hillshade(heights: np.ndarray, gsd: float) -> np.ndarray:
 
 
 def with_margin(model: DatasetReader, window: Window, margin: int = 1) -> np.ndarray:
-    """(H + 2 margin, W + 2 margin) float64 heights of a window and the cells around it; NaN where there is no surface."""
+    """(H + 2 margin, W + 2 margin) float64 heights of a window and cells around it; NaN where there is no surface."""
     left, top = max(0, window.left - margin), max(0, window.top - margin)
     right = min(model.width, window.left + window.width + margin)
     below = min(model.height, window.top + window.height + margin)

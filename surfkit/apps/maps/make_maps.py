@@ -271,9 +271,7 @@ def trace(sheet: GeoTiffSettings, interval: float, side: int) -> dict[str, Any]:
     }
 
 
-def scatter(
-    surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float, classify: Classify | None
-) -> dict[str, Any]:
+def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float, classify: Classify | None) -> dict[str, Any]:
     """Write the point cloud, and return what maps.json says of it."""
     counts = write_cloud(surface, sheet, PRODUCT_FILES["points"], spacing, classify)
     return {"spacing": spacing, "points": sum(counts.values())} | ({} if classify is None else {"classes": counts})

@@ -99,12 +99,11 @@ class Ground:
 
     def over(self, values: np.ndarray, window: Window) -> np.ndarray:
         """(H, W) coarse values at the centres of cells of the map; the window may lie partly beyond it."""
-        rows, columns = window.top + np.arange(window.height), window.left + np.arange(window.width)
-        return between_cells(values, self.factor, rows, columns)
+        return between_cells(values, self.factor, *_numbers(window))
 
     def is_within(self, window: Window) -> np.ndarray:
         """(H, W) bool of cells of the map."""
-        rows, columns = window.top + np.arange(window.height), window.left + np.arange(window.width)
+        rows, columns = _numbers(window)
         return self.within[np.ix_(rows // self.factor, columns // self.factor)]
 
     def classes_of(self, places: np.ndarray, grid: MapGrid) -> np.ndarray:
@@ -121,12 +120,15 @@ class Ground:
             for each in (self.terrain, self.tolerance, self.distance)
         )
         above = places[:, 2] - terrain
-        inside = [at.astype(np.int64).clip(0, size - 1) for at, size in zip((row, column), self.kinds.shape, strict=True)]
-        found = np.where(above >= LEAST_OBJECT_METRES * self.metre, self.kinds[tuple(inside)], UNCLASSIFIED)
+        high, wide = self.kinds.shape
+        kinds = self.kinds[row.astype(np.int64).clip(0, high - 1), column.astype(np.int64).clip(0, wide - 1)]
+        found = np.where(above >= LEAST_OBJECT_METRES * self.metre, kinds, UNCLASSIFIED)
         return np.where(distance > self.reach, UNCLASSIFIED, np.where(np.abs(above) <= tolerance, GROUND, found))
 
 
-def find_ground(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: TerrainSettings, metre: float) -> Ground:
+def find_ground(
+    surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: TerrainSettings, metre: float
+) -> Ground:
     """Find the ground of a surface model; what an interrupted call found is not looked for again.
 
     Args:
@@ -145,9 +147,9 @@ def find_ground(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settin
         with replacing(kept) as file:
             np.savez(file, **asdict(found))
     with np.load(kept) as parts:
-        factor, reach, length = int(parts["factor"]), float(parts["reach"]), float(parts["metre"])
-        arrays = (parts[name] for name in ("terrain", "tolerance", "distance", "within", "kinds"))
-        return Ground(factor, *arrays, reach, length)
+        arrays = {name: parts[name] for name in ("terrain", "tolerance", "distance", "within", "kinds")}
+        reach, length = float(parts["reach"]), float(parts["metre"])
+        return Ground(factor=int(parts["factor"]), reach=reach, metre=length, **arrays)
 
 
 def coarse_factor(grid: MapGrid, metre: float) -> int:
@@ -178,9 +180,11 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
         least = max(1, int(LEAST_SHARE * factor**2))
         tolerance = _tolerance(terrain, cell, settings, metre)
         for rows, columns, blocks, window in _blocks(file, grid, factor, "measuring the ground"):
-            near = [between_cells(each, factor, *_numbers(window)).reshape(blocks.shape) for each in (terrain, tolerance)]
+            expected, allowed = (
+                between_cells(each, factor, *_numbers(window)).reshape(blocks.shape) for each in (terrain, tolerance)
+            )
             with np.errstate(invalid="ignore"):
-                seen[rows, columns] = _means(blocks, np.abs(blocks - near[0]) <= near[1], least)
+                seen[rows, columns] = _means(blocks, np.abs(blocks - expected) <= allowed, least)
     told = np.isfinite(seen)
     if not told.any():
         raise BadInput(
@@ -200,7 +204,7 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
 
 
 def _tolerance(terrain: np.ndarray, cell: float, settings: TerrainSettings, metre: float) -> np.ndarray:
-    """(H, W) distance from the ground up to which a surface is ground; steeper than the ground may be counts as that."""
+    """(H, W) distance from the ground up to which a surface is ground; more where that is steep, up to the slope it has."""
     slope = slope_of(terrain, cell).clip(max=settings.slope)
     return (settings.height + SLOPE_TOLERANCE * slope) * metre
 
@@ -252,7 +256,9 @@ def _green(surface: SurfaceFile, grid: MapGrid, terrain: np.ndarray, factor: int
     return np.where(count > 0, total / count.clip(1), np.nan).reshape(high, wide)
 
 
-def write_terrain(sheet: GeoTiffSettings, ground: Ground, model: str, names: Sequence[str], side: int) -> dict[str, Any]:
+def write_terrain(
+    sheet: GeoTiffSettings, ground: Ground, model: str, names: Sequence[str], side: int
+) -> dict[str, Any]:
     """Write the terrain model, the heights above ground and the distances to ground that is seen, and return what
     maps.json says of them.
 
@@ -315,4 +321,3 @@ def terrain_tile(
     counted = np.isfinite(surface)
     facts = {"cells": counted.sum(), "seen": (seen & there).sum(), "untold": (counted & ~there).sum()}
     return (terrain, surface - terrain, distance), {name: int(value) for name, value in facts.items()}
-
