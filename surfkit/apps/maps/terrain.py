@@ -204,7 +204,7 @@ def _found(surface: SurfaceFile, sheet: GeoTiffSettings, model: str, settings: T
 
 
 def _tolerance(terrain: np.ndarray, cell: float, settings: TerrainSettings, metre: float) -> np.ndarray:
-    """(H, W) distance from the ground up to which a surface is ground; more where that is steep, up to the slope it has."""
+    """(H, W) distance from the ground up to which a surface is ground: more where that is steep."""
     slope = slope_of(terrain, cell).clip(max=settings.slope)
     return (settings.height + SLOPE_TOLERANCE * slope) * metre
 
