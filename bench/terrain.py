@@ -5,9 +5,9 @@
 
 Maps are drawn of the exact mesh, and of its heights smoothed and with noise; maps of a run may be given too. TRUTH.ply
 is the exact mesh (shibuya-synth: gt/mesh.ply, from -120 to 120 m). Its ground is the triangles with corners on a
-lattice of 4 m; it goes on beneath buildings. Ground is seen where it is the highest surface of the exact mesh. Counted are cells within
-20 m of one that is; from these, those on ground that is seen, and those below something. Also counted: the share of
-ground that is seen which the cloud has in class 2, and of the surface 2 m and more above ground which it has not.
+lattice of 4 m; it goes on beneath buildings. Ground is seen where it is the highest surface of the exact mesh. Counted
+are cells within 20 m of one that is; from these, those on ground that is seen, and those below something. Also counted:
+classes of the points of the cloud that lie on ground that is seen, and of those 2 m and more above ground.
 Results go to bench/results/terrain.json. The map is level, z up.
 """
 
