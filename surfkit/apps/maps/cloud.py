@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -25,8 +25,14 @@ STEPS_PER_SPACING = 1000
 """Steps of a coordinate within the distance of points."""
 
 
-def write_cloud(surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing: float) -> int:
-    """Write points on a mesh, one for each square of so long a side, and return how many there are.
+Classify = Callable[[np.ndarray], np.ndarray]
+"""(n,) uint8 classes of the LAS specification, of (n, 3) easting, northing and height."""
+
+
+def write_cloud(
+    surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing: float, classify: Classify | None = None
+) -> dict[str, int]:
+    """Write points on a mesh, one for each square of so long a side, and return how many there are of each class.
 
     Point format 7: coordinates, and colours of 16 bits where the mesh has some; the coordinate reference system as
     well-known text.
@@ -36,6 +42,7 @@ def write_cloud(surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing
         sheet: Where; points outside of its cells are left out.
         name: File name.
         spacing: Side of a square, units of the input.
+        classify: Tells the classes of points; None leaves them at 0, never classified.
 
     Raises:
         BadInput: A package is missing, or coordinates span more than the format holds.
@@ -57,7 +64,7 @@ def write_cloud(surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing
         raise BadInput(f"--spacing {spacing:g}: too fine for a LAZ file of this width; give a larger one")
     header.vlrs.append(WktCoordinateSystemVlr(sheet.crs.to_wkt(version="WKT1_GDAL")))
     header.global_encoding.wkt = True
-    path, count = sheet.folder / name, 0
+    path, counts = sheet.folder / name, np.zeros(256, np.int64)
     with path.open("wb") as file, laspy.open(file, "w", header=header, do_compress=True, closefd=False) as writer:
         for places, colors in sample_evenly(surface, spacing**2):
             places = sheet.grid.to_map(places)
@@ -69,10 +76,12 @@ def write_cloud(surface: SurfaceFile, sheet: GeoTiffSettings, name: str, spacing
             if colors is not None:
                 for channel, color in enumerate(COLOR_CHANNELS):
                     record[color] = colors[inside, channel].astype(np.uint16) * 257
+            if classify is not None:
+                record.classification[:] = classify(places[inside])
             writer.write_points(record)
-            count += len(record)
+            counts += np.bincount(np.asarray(record.classification), minlength=256)
     sheet.deliver(path)
-    return count
+    return {str(number): int(counts[number]) for number in np.flatnonzero(counts)}
 
 
 def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:

@@ -28,7 +28,8 @@ from surfkit.train.progress_bars import bars
 
 @dataclass(frozen=True)
 class MapsCommand:
-    """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud.
+    """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud,
+    and terrain without buildings and trees.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
     --against, the heights of another mesh are subtracted. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
@@ -123,6 +124,10 @@ def show(out: Path, record: dict[str, Any]) -> None:
         rows.append(("contour lines", f"{found['lines']:,}, every {found['interval']:g} {unit}{left}"))
     if found := record.get("points"):
         rows.append(("points", f"{found['points']:,}, one for {found['spacing']:g} x {found['spacing']:g} {unit}"))
+    if found := record.get("terrain"):
+        rows.append(("ground that is seen", f"{found['ground_seen']:.1%} of the surface"))
+        told = f"{found['without_terrain']:.1%} of it: no ground within {found['reach']:g} {unit}"
+        rows.append(("without terrain", told))
     if found := record.get("difference"):
         rows += [
             ("above (fill)", f"{found['fill']:,.6g} {unit}³ on {found['area']:,.6g} {unit}² compared"),

@@ -27,7 +27,7 @@ def draw_hillshade(sheet: GeoTiffSettings, heights: str, name: str, side: int) -
     with rasterio.open(sheet.out / heights) as model, sheet.raster(name, "shades") as file:
         for at, window in enumerate(windows):
             if file.facts(window) is None:
-                file.write(hillshade(_with_margin(model, window), sheet.grid.gsd), window, {})
+                file.write(hillshade(with_margin(model, window), sheet.grid.gsd), window, {})
             emit(Progress("shading", at + 1, len(windows)))
 
 
@@ -47,14 +47,14 @@ def hillshade(heights: np.ndarray, gsd: float) -> np.ndarray:
     return np.where(np.isfinite(share), np.rint(1 + 254 * share), 0).astype(np.uint8)
 
 
-def _with_margin(model: DatasetReader, window: Window) -> np.ndarray:
-    """(H + 2, W + 2) float64 heights of a window and the cells around it; NaN where there is no surface."""
-    left, top = max(0, window.left - 1), max(0, window.top - 1)
-    right = min(model.width, window.left + window.width + 1)
-    below = min(model.height, window.top + window.height + 1)
+def with_margin(model: DatasetReader, window: Window, margin: int = 1) -> np.ndarray:
+    """(H + 2 margin, W + 2 margin) float64 heights of a window and cells around it; NaN where there is no surface."""
+    left, top = max(0, window.left - margin), max(0, window.top - margin)
+    right = min(model.width, window.left + window.width + margin)
+    below = min(model.height, window.top + window.height + margin)
     inner = Window(left, top, right - left, below - top)
-    found = np.full((window.height + 2, window.width + 2), np.nan)
-    row, column = top - window.top + 1, left - window.left + 1
+    found = np.full((window.height + 2 * margin, window.width + 2 * margin), np.nan)
+    row, column = top - window.top + margin, left - window.left + margin
     found[row : row + inner.height, column : column + inner.width] = read_heights(model, inner)
     return found
 

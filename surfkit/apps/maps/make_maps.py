@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from surfkit.apps.maps.cloud import write_cloud
+from surfkit.apps.maps.cloud import Classify, write_cloud
 from surfkit.apps.maps.contours import even_interval, write_contours
 from surfkit.apps.maps.difference import Difference, draw_difference, write_difference
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
@@ -18,6 +19,7 @@ from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
 from surfkit.apps.maps.orthophoto import OrthophotoColors
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
+from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.apps.texture.texture_cache import TextureCache, identity, seen
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
@@ -34,8 +36,12 @@ from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.up_direction import map_axes, up_direction
 
-Product = Literal["orthophoto", "hillshade", "contours", "points"]
-PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
+Product = Literal["orthophoto", "hillshade", "contours", "points", "terrain"]
+PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points", "terrain")
+USUAL_PRODUCTS: tuple[Product, ...] = PRODUCTS[:4]
+"""All but the terrain, which is a guess with settings of its own."""
+TERRAIN_FILES = ("terrain", "above", "ground")
+"""Files of a terrain model."""
 COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
 SHORTEST_CELLS = 30
@@ -48,8 +54,9 @@ PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 class MapSettings:
     """What is drawn, and how."""
 
-    products: tuple[Product, ...] = PRODUCTS
-    """What to write beside the surface model (dsm.tif)."""
+    products: tuple[Product, ...] = USUAL_PRODUCTS
+    """What to write beside the surface model (dsm.tif). `terrain` is the ground without buildings and trees, heights
+    above it, and classes of the points."""
 
     gsd: Length = "auto"
     """Side of a cell (ground sampling distance), metres; in units of the data set where it does not say how long these
@@ -83,6 +90,9 @@ class MapSettings:
     memory: str = "auto"
     """Memory for photographs, such as 4GB, with --colors photographs; auto is half of the free memory."""
 
+    terrain: TerrainSettings = TerrainSettings()
+    """How the ground is found, with `--products terrain`."""
+
     def __post_init__(self) -> None:
         cache_bytes(self.memory, "--memory")
         if self.colors == "photographs" and "orthophoto" not in self.products:
@@ -100,8 +110,9 @@ class MapSettings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the products, the surface model first."""
-        return ("dsm", *(name for name in PRODUCTS if name in self.products))
+        """Names of the files in PRODUCT_FILES, the surface model first."""
+        chosen = (name for name in PRODUCTS if name in self.products and name != "terrain")
+        return ("dsm", *chosen, *(TERRAIN_FILES if "terrain" in self.products else ()))
 
     def refuse_missing(self) -> None:
         """BadInput if a package is missing, before anything is done."""
@@ -131,6 +142,11 @@ def make_maps(
     """
     settings.refuse_missing()
     frame, surface = subject.frame, subject.surface
+    if "terrain" in settings.products and frame.metres is None:
+        raise BadInput(
+            "--products terrain: it needs lengths in metres, and the data set does not say how long its unit is; give "
+            "--metres-per-unit (1 if its coordinates are metres)"
+        )
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
     grid = grid_of(subject, settings, map_axes(up.direction))
@@ -235,9 +251,19 @@ def draw_products(
         least = SHORTEST_CELLS * sheet.grid.gsd if settings.shortest == "auto" else settings.shortest / units
         name = PRODUCT_FILES["contours"]
         record["contours"] = sheet.once([name], lambda: trace(sheet, interval, least, settings.tile))
+    classify = None
+    if "terrain" in done:
+        names = [PRODUCT_FILES[name] for name in TERRAIN_FILES]
+        ground = find_ground(subject.surface, sheet, PRODUCT_FILES["dsm"], settings.terrain, 1 / units)
+        record["terrain"] = sheet.once(
+            names, lambda: write_terrain(sheet, ground, PRODUCT_FILES["dsm"], names, settings.tile)
+        )
+        classify = partial(ground.classes_of, grid=sheet.grid)
     if "points" in done:
         spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
-        record["points"] = sheet.once([PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
+        record["points"] = sheet.once(
+            [PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing, classify)
+        )
     return record
 
 
@@ -253,9 +279,10 @@ def trace(sheet: GeoTiffSettings, interval: float, least: float, side: int) -> d
     return {"interval": interval, "lines": lines, "shortest": least, "too_short": short}
 
 
-def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float) -> dict[str, Any]:
+def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float, classify: Classify | None) -> dict[str, Any]:
     """Write the point cloud, and return what maps.json says of it."""
-    return {"spacing": spacing, "points": write_cloud(surface, sheet, PRODUCT_FILES["points"], spacing)}
+    counts = write_cloud(surface, sheet, PRODUCT_FILES["points"], spacing, classify)
+    return {"spacing": spacing, "points": sum(counts.values())} | ({} if classify is None else {"classes": counts})
 
 
 def subtract(sheet: GeoTiffSettings, other: SurfaceFile, side: int, unit: str) -> dict[str, Any]:

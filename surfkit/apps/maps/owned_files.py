@@ -14,7 +14,8 @@ from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 
 PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
-    "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
+    "points": "points.laz", "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
+    "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
 }  # fmt: skip
 MAPS_RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""

@@ -155,7 +155,7 @@ def test_a_laz_file_is_read_back(tmp_path):
     grid = grid_of(0.25, *UTM, UTM[0] + 20, UTM[1] + 10)
     crs, _ = map_crs(FRAME)
     with workshop(tmp_path, ()) as folder:
-        count = write_cloud(surface, GeoTiffSettings(grid, crs, folder, tmp_path), "points.laz", 0.2)
+        count = write_cloud(surface, GeoTiffSettings(grid, crs, folder, tmp_path), "points.laz", 0.2)["0"]
     with laspy.open(tmp_path / "points.laz") as file:
         header, points = file.header, file.read()
     assert (str(header.version), header.point_format.id, header.are_points_compressed) == ("1.4", 7, True)
