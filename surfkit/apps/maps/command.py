@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.apps.maps.make_maps import MAPS_RECORD, MapSettings, make_maps
 from surfkit.apps.maps.map_grid import same_crs
+from surfkit.apps.maps.volume_table import show_volumes
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
@@ -31,7 +32,7 @@ class MapsCommand:
     """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
-    --against, the heights of another mesh are subtracted. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
+    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
     RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same
     command goes on where it stopped.
     """
@@ -60,6 +61,8 @@ class MapsCommand:
     def run(self) -> None:
         """Draw the maps, and print what they are."""
         self.settings.refuse_missing()
+        if self.settings.least_difference and self.against is None:
+            raise BadInput("--least-difference: it is of two dates; name the other one too, --against OTHER")
         run = opened(self.run_folder)
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
@@ -133,7 +136,13 @@ def show(out: Path, record: dict[str, Any]) -> None:
             ),
             ("no surface", f"{found['only_other']:,} cells here, {found['only_here']:,} cells there"),
         ]
+        if least := found["least_difference"]:
+            told = f"{found['unchanged']:,.6g} {unit}², which differ by less than {least:g} {unit}"
+            rows.append(("taken as unchanged", told))
     print_table(("map", "value"), rows)
+    if found := record.get("volumes"):
+        print()
+        show_volumes(found["polygons"], unit)
     print()
     print_table(("written",), [(str(out / name),) for name in (*record["files"], MAPS_RECORD)])
 

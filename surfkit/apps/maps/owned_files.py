@@ -15,6 +15,7 @@ from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
+    "volumes": "volumes.gpkg", "volumes-table": "volumes.csv",
 }  # fmt: skip
 MAPS_RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""

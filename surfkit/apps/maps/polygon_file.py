@@ -53,6 +53,10 @@ class AreaPolygon:
         """All outlines and holes."""
         return [ring for part in self.parts for ring in part]
 
+    def as_lists(self) -> list[Any]:
+        """The same as JSON has it."""
+        return [self.name, [[ring.tolist() for ring in part] for part in self.parts]]
+
     @property
     def area(self) -> float:
         """In square units of the map, without holes."""
@@ -84,9 +88,9 @@ def read_polygons(path: Path, grid: MapGrid, crs: str | None) -> list[AreaPolygo
         if not parts:
             raise BadInput(f"{where}: it is empty; draw it, or delete it from the file")
         parts = [[_without_repeats(ring) for ring in part] for part in parts]
-        for ring in (ring for part in parts for ring in part):
-            if len(ring) < LEAST_CORNERS or not np.isfinite(ring).all() or signed_area(ring) == 0:
-                raise BadInput(f"{where}: a ring of it encloses nothing; it needs three corners that are not in line")
+        rings = [ring for part in parts for ring in part]
+        if any(len(ring) < LEAST_CORNERS or not np.isfinite(ring).all() for ring in rings):
+            raise BadInput(f"{where}: a ring of it has less than three corners, or one that is no number; draw it anew")
         refuse_crossing(where, parts)
         _refuse_beside(where, np.concatenate([part[0] for part in parts]), move, grid)
         moved = [[move(ring) for ring in part] for part in parts]

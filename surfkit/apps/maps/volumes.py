@@ -225,6 +225,12 @@ def write_volumes(
     sheet.deliver(path)
 
 
+def volumes_record(volumes: Sequence[Volume]) -> dict[str, Any]:
+    """What maps.json says of volumes: each of them, and the sums of fill, cut and net."""
+    sums = {name: sum(getattr(volume, name) for volume in volumes) for name in ("fill", "cut", "net")}
+    return {**sums, "polygons": [asdict(volume) for volume in volumes]}
+
+
 def _binary(polygon: AreaPolygon) -> bytes:
     """Well-known binary of a polygon, as one of many parts."""
     found = struct.pack("<BII", 1, WKB_MULTIPOLYGON, len(polygon.parts))
