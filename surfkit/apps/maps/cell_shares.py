@@ -41,7 +41,7 @@ class OutlinePieces:
         down, right = self.down[first:last], self.right[first:last]
         before, within = column < 0, (column >= 0) & (column < window.width)
         steps = np.zeros((window.height, window.width + 1))
-        np.add.at(steps, (row[before], 0), down[before])
+        np.add.at(steps[:, 0], row[before], down[before])
         np.add.at(steps, (row[within], column[within]), down[within] * (1 - right[within]))
         np.add.at(steps, (row[within], column[within] + 1), down[within] * right[within])
         found = np.cumsum(steps, axis=1)[:, :-1]
@@ -61,7 +61,7 @@ def outline_pieces(rings: Sequence[np.ndarray], grid: MapGrid) -> OutlinePieces:
     """
     starts = np.concatenate([ring[:-1] for ring in rings]) / grid.gsd
     ends = np.concatenate([ring[1:] for ring in rings]) / grid.gsd
-    starts, ends = ([1, -1] * (place - [grid.west, grid.north]) for place in (starts, ends))
+    starts, ends = ((place - [grid.west, grid.north]) * np.array([1.0, -1.0]) for place in (starts, ends))
     size = np.array([grid.width, grid.height], np.float64)
     for axis in range(2):
         borders = np.tile([0.0, size[axis]], (len(starts), 1))

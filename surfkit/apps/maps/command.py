@@ -32,9 +32,10 @@ class MapsCommand:
     """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
-    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
-    RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same
-    command goes on where it stopped.
+    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs
+    `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`,
+    `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same command goes on where
+    it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]

@@ -35,6 +35,7 @@ from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
+from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes, up_direction
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
@@ -157,8 +158,7 @@ def make_maps(
         refuse_apart(surface, grid)
     if other is not None:
         refuse_apart(other, grid)
-    placed = None if frame.crs is None else crs.to_wkt()
-    polygons = [] if settings.volume is None else read_polygons(settings.volume, grid, placed)
+    polygons = [] if settings.volume is None else read_polygons(settings.volume, grid, frame.crs)
     done, unit = drawable(surface, settings), unit_of(frame)
     files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()),
              *(VOLUME_FILES if polygons else ()))]  # fmt: skip

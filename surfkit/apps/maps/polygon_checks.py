@@ -55,8 +55,8 @@ def refuse_crossing(where: str, parts: Sequence[Sequence[np.ndarray]]) -> None:
                 raise BadInput(f"{where}: hole {at + 1} lies beyond the outline; repair it (in QGIS: Fix geometries)")
         if any(_within(one, other) for one in part[1:] for other in part[1:] if one is not other):
             raise BadInput(f"{where}: one of its holes lies within another; repair it (in QGIS: Fix geometries)")
-    for one, other in ((one, other) for one in parts for other in parts if one is not other):
-        if _within(one[0], other[0]) and not any(_within(one[0], hole) for hole in other[1:]):
+    for part, whole in ((part, whole) for part in parts for whole in parts if part is not whole):
+        if _within(part[0], whole[0]) and not any(_within(part[0], hole) for hole in whole[1:]):
             raise BadInput(f"{where}: one of its parts lies within another; repair it (in QGIS: Fix geometries)")
 
 

@@ -19,7 +19,7 @@ from surfkit.apps.maps.polygon_checks import refuse_crossing, signed_area
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.scene.crs import exact, in_plan
+from surfkit.scene.crs import TOPOCENTRIC, degrees_of, exact, in_plan, missing, not_installed, parsed
 
 NAME_FIELDS = ("name", "label", "title", "id", "nr", "number")
 """Fields that a polygon is called by, in any case; the first of them that is there."""
@@ -73,14 +73,14 @@ def read_polygons(path: Path, grid: MapGrid, crs: str | None) -> list[AreaPolygo
     Args:
         path: The file, with one layer.
         grid: The map, on which each polygon must lie in part.
-        crs: System of the map, as pyproj reads it; None for one that is not georeferenced.
+        crs: System of the data set, as its frame names it; None for one that is not georeferenced.
 
     Raises:
         BadInput: A package is missing; the file cannot be read, or has no polygons or other shapes; a polygon is not
             sound, or lies beside the map; or its coordinates cannot be transformed.
     """
     names, shapes, system = _read(path)
-    move = _mover(path, system, crs)
+    move = _mover(path, system, crs, grid)
     found = []
     for number, (name, shape) in enumerate(zip(names, shapes, strict=True), 1):
         where = f"{path}: polygon {number}" + (f" ({name!r})" if name != str(number) else "")
@@ -151,7 +151,7 @@ def _system(path: Path, text: str | None) -> CRS | None:
     return None if found.is_engineering else in_plan(found)
 
 
-def _mover(path: Path, system: CRS | None, crs: str | None) -> Move:
+def _mover(path: Path, system: CRS | None, crs: str | None, grid: MapGrid) -> Move:
     """What turns coordinates of a file into those of the map; infinite where they cannot be."""
     if system is None:
         emit(Warned(f"{path}: it names no coordinate reference system; its coordinates are taken as those of the map"))
@@ -162,12 +162,20 @@ def _mover(path: Path, system: CRS | None, crs: str | None) -> Move:
             f"{path}: its coordinates are in {system.name}, and the map is not georeferenced; give a file in "
             f"coordinates of the map, without a coordinate reference system{none}"
         )
-    known = exact(system, in_plan(CRS(crs)))
+    place = TOPOCENTRIC.fullmatch(crs)
+    drawn = f"+proj=ortho +lat_0={place[1]} +lon_0={place[2]} +datum=WGS84 +units=m" if place else crs
+    target, west, south = in_plan(parsed(drawn)), *grid.bounds[:2]
+    known = exact(system, target)
     if known is None:
         raise BadInput(
             f"{path}: no transformation from its system, {system.name}, to that of the map, {crs}, is known here; "
             "convert the file to that of the map, for example in QGIS"
         )
+    lon, lat = degrees_of(drawn, np.array([[west, south]]))
+    if np.isfinite([*lon, *lat]).all():
+        grids, _ = missing(system, target, float(lon[0]), float(lat[0]))
+        if grids:
+            emit(Warned(f"{path}: a better transformation to {crs} is not in use: {not_installed(grids)}"))
     return lambda places: np.stack(known.transform(*places.T), axis=1)
 
 

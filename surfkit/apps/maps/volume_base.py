@@ -165,9 +165,7 @@ def _plane(places: np.ndarray, middle: np.ndarray, outline: OutlineHeights) -> B
     terms_of = np.linalg.lstsq(terms * weight[:, None], outline.heights * weight, rcond=None)[0]
     found = terms @ terms_of
     residual = float(np.sqrt(((outline.heights - found) * weight) @ ((outline.heights - found) * weight)))
-    return Base(
-        lambda at: terms_of[0] + (at - middle) @ terms_of[1:], float(found.min()), float(found.max()), residual
-    )
+    return Base(lambda at: terms_of[0] + (at - middle) @ terms_of[1:], float(found.min()), float(found.max()), residual)
 
 
 def _triangulated(places: np.ndarray, middle: np.ndarray, outline: OutlineHeights) -> Base:

@@ -10,10 +10,10 @@ from surfkit.cli.console_table import print_table
 
 def show_volumes(volumes: Sequence[dict[str, Any]], unit: str) -> None:
     """Print a table of volumes; each is what maps.json says of a polygon, and the unit that of lengths."""
-    head = ["polygon", f"area, {unit}²", "no surface", "base", f"base at, {unit}", f"fill, {unit}³", f"cut, {unit}³",
-            f"net, {unit}³", f"mean height, {unit}", f"highest, {unit}"]  # fmt: skip
+    units = f"{unit}, {unit}², {unit}³"
     fitted, dates = volumes[0]["base_error"] is not None, volumes[0]["fill_since"] is not None
-    head += [f"error of the base, {unit}³"] if fitted else []
+    head = [f"polygon ({units})", "area", "no surface", "base", "base at", "fill", "cut", "net", "mean height"]
+    head += ["highest", *(["error of base"] if fitted else [])]
     rows = [
         [
             each["name"], f"{each['area']:,.6g}", f"{each['without_surface']:.1%}", each["base"], _span(each),
@@ -25,8 +25,7 @@ def show_volumes(volumes: Sequence[dict[str, Any]], unit: str) -> None:
     print_table(head, rows)
     if dates:
         print()
-        head = ["polygon, since the other date", f"compared, {unit}²", f"changed, {unit}²", f"fill, {unit}³",
-                f"cut, {unit}³", f"net, {unit}³"]  # fmt: skip
+        head = [f"changes ({units})", "compared", "changed", "fill", "cut", "net"]
         names = ("compared", "changed", "fill_since", "cut_since", "net_since")
         print_table(head, [[each["name"], *(f"{each[name]:,.6g}" for name in names)] for each in volumes])
 

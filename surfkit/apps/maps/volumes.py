@@ -238,5 +238,3 @@ def _binary(polygon: AreaPolygon) -> bytes:
         found += struct.pack("<BII", 1, WKB_POLYGON, len(part))
         found += b"".join(struct.pack("<I", len(ring)) + ring.astype("<f8").tobytes() for ring in part)
     return found
-
-
