@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surfkit.apps.maps.cell_shares import OutlinePieces, outline_pieces
-from surfkit.apps.maps.geotiff import GeoTiffSettings
+from surfkit.apps.maps.geotiff import GDAL_CACHE_MB, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.polygon_file import AreaPolygon
@@ -25,7 +25,7 @@ from surfkit.core.optional import needed
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-BLOCK_ROWS, BLOCK_COLUMNS = 512, 4096
+BLOCK_ROWS, BLOCK_COLUMNS = 512, 2048
 """Cells that are in memory at once. They do not depend on --tile, so volumes do not either, to the last bit."""
 TOLD_MISSING = 0.01
 """Share of a polygon without surface from which on a message tells of it."""
@@ -120,7 +120,7 @@ def measure_volumes(
     import rasterio
 
     found = []
-    with rasterio.open(heights) as model:
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), rasterio.open(heights) as model:
         theirs = None if other is None else rasterio.open(other)
         try:
             for at, polygon in enumerate(polygons):

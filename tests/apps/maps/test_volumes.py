@@ -170,8 +170,8 @@ def test_a_triangulated_base_follows_an_outline_that_bends_inwards(tmp_path):
 
 
 def test_small_turned_polygons_of_some_ten_cells(tmp_path):
-    """Cells count by their share: the volume of a slab is its area times its height, to the last digits; that of a slope
-    is off by less than 0.5 %, where cells that count by their centres are by 10 % and more."""
+    """Cells count by their share: the volume of a slab is its area times its height, to the last digits. That of a
+    slope is off by less than 0.5 %, where cells that count by their centres are off by up to 10 %."""
     shapes = [[box((-1.7, -1.1), (1.6, 1.3), degrees)] for degrees in (0, 31, 77)]
     path = geojson(tmp_path / "a.geojson", *shapes)
     for found in measured(tmp_path, path, lambda x, y: 53 + 0 * x, gsd=0.7, base=50.0):
