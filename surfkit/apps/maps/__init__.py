@@ -1,1 +1,1 @@
-"""Maps of a surface: heights, orthophoto, hillshade, contour lines, point cloud, differences of two surfaces."""
+"""Maps of a surface: heights, orthophoto, hillshade, contour lines, point cloud, differences, volumes."""

@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.apps.maps.make_maps import MAPS_RECORD, MapSettings, make_maps
 from surfkit.apps.maps.map_grid import same_crs
+from surfkit.apps.maps.volume_table import show_volumes
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
@@ -32,9 +33,10 @@ class MapsCommand:
     and terrain without buildings and trees.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
-    --against, the heights of another mesh are subtracted. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
-    RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same
-    command goes on where it stopped.
+    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs
+    `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`,
+    `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same command goes on where
+    it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -61,6 +63,8 @@ class MapsCommand:
     def run(self) -> None:
         """Draw the maps, and print what they are."""
         self.settings.refuse_missing()
+        if self.settings.least_difference and self.against is None:
+            raise BadInput("--least-difference: it is of two dates; name the other one too, --against OTHER")
         run = opened(self.run_folder)
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
@@ -139,7 +143,13 @@ def show(out: Path, record: dict[str, Any]) -> None:
             ),
             ("no surface", f"{found['only_other']:,} cells here, {found['only_here']:,} cells there"),
         ]
+        if least := found["least_difference"]:
+            told = f"{found['unchanged']:,.6g} {unit}², which differ by less than {least:g} {unit}"
+            rows.append(("taken as unchanged", told))
     print_table(("map", "value"), rows)
+    if found := record.get("volumes"):
+        print()
+        show_volumes(found["polygons"], unit)
     print()
     print_table(("written",), [(str(out / name),) for name in (*record["files"], MAPS_RECORD)])
 

@@ -39,6 +39,8 @@ class Difference:
         percentile_90: Of their absolute values.
         only_here: Cells where there is no other surface.
         only_other: Cells where there is only the other.
+        least_difference: Least detectable difference, units: cells that differ by less count in neither volume.
+        unchanged: Area of these cells.
     """
 
     cells: int
@@ -50,12 +52,17 @@ class Difference:
     percentile_90: float
     only_here: int
     only_other: int
+    least_difference: float = 0.0
+    unchanged: float = 0.0
 
 
-def write_difference(sheet: GeoTiffSettings, heights: tuple[Path, Path], name: str, side: int) -> Difference:
+def write_difference(
+    sheet: GeoTiffSettings, heights: tuple[Path, Path], name: str, side: int, least: float = 0.0
+) -> Difference:
     """Write the difference of two surface models on the grid of the sheet, in tiles of so many cells.
 
-    Volumes are sums over cells, each as high as its centre. Percentiles are within a millionth of the range.
+    Volumes are sums over cells, each as high as its centre; cells that differ by less than `least`, the least
+    detectable difference, are left out of them. Percentiles are of all cells, within a millionth of the range.
 
     Raises:
         BadInput: No cell has both.
@@ -69,7 +76,7 @@ def write_difference(sheet: GeoTiffSettings, heights: tuple[Path, Path], name: s
                 facts = file.facts(window)
                 if facts is None:
                     ours, theirs = read_heights(here, window), read_heights(other, window)
-                    facts = _counted(ours, theirs)
+                    facts = _counted(ours, theirs, least)
                     if facts["cells"]:
                         differences = ours - theirs
                         file.write(np.where(np.isfinite(differences), differences, NODATA), window, facts)
@@ -80,17 +87,20 @@ def write_difference(sheet: GeoTiffSettings, heights: tuple[Path, Path], name: s
                 raise BadInput(f"no cell of {sheet.grid.gsd:g} has both surfaces: they do not lie in the same place")
     cell, counts = sheet.grid.gsd**2, (total["only_here"], total["only_other"])
     volumes = total["cells"] * cell, total["fill"] * cell, total["cut"] * cell
-    return Difference(total["cells"], *volumes, *_percentiles(sheet, name, side), *counts)
+    percentiles = _percentiles(sheet, name, side)
+    return Difference(total["cells"], *volumes, *percentiles, *counts, least, total["unchanged"] * cell)
 
 
-def _counted(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
+def _counted(ours: np.ndarray, theirs: np.ndarray, least: float) -> dict[str, Any]:
     """Of a tile: cells with both surfaces, sums of the heights above and below, and cells with one surface only."""
     differences = ours - theirs
     both = np.isfinite(differences)
+    changed = both & (np.abs(differences) >= least)
     return {
         "cells": int(both.sum()),
-        "fill": float(differences[both].clip(min=0).sum()),
-        "cut": -float(differences[both].clip(max=0).sum()),
+        "fill": float(differences[changed].clip(min=0).sum()),
+        "cut": -float(differences[changed].clip(max=0).sum()),
+        "unchanged": int((both & ~changed).sum()),
         "only_here": int((np.isfinite(ours) & ~both).sum()),
         "only_other": int((np.isfinite(theirs) & ~both).sum()),
     }

@@ -18,8 +18,11 @@ from surfkit.apps.maps.hillshade import draw_hillshade
 from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
 from surfkit.apps.maps.orthophoto import OrthophotoColors
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
+from surfkit.apps.maps.polygon_file import AreaPolygon, read_polygons
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
+from surfkit.apps.maps.volume_base import BaseKind
+from surfkit.apps.maps.volumes import VolumeSettings, measure_volumes, volumes_record, write_volumes
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.apps.texture.texture_cache import TextureCache, identity, seen
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
@@ -34,6 +37,7 @@ from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
+from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes, up_direction
 
 Product = Literal["orthophoto", "hillshade", "contours", "points", "terrain"]
@@ -46,6 +50,8 @@ COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
 SHORTEST_CELLS = 30
 """Length of the shortest contour line that is written without being asked for others, cells."""
+VOLUME_FILES = ("volumes", "volumes-table")
+"""Files of volumes."""
 PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 """What products need beside rasterio."""
 
@@ -93,7 +99,26 @@ class MapSettings:
     terrain: TerrainSettings = TerrainSettings()
     """How the ground is found, with `--products terrain`."""
 
+    volume: Path | None = None
+    """Measure volumes within the polygons of this file, GeoJSON, GPKG or SHP: of the surface above a base (fill) and
+    below it (cut). With --against, also those by which heights changed."""
+
+    base: BaseKind | float = "triangulated"
+    """What --volume measures from: `triangulated`, a surface between the heights along the outline of the polygon;
+    `plane`, their plane of least squares; `lowest`, a level plane at the lowest of them; or a level plane at this
+    height, in coordinates of the map."""
+
+    least_difference: float = 0.0
+    """With --against, the least detectable difference of heights, like --gsd: volumes leave out cells that differ by
+    less."""
+
     def __post_init__(self) -> None:
+        if not isinstance(self.base, str) and not abs(self.base) < float("inf"):
+            raise BadInput(f"--base {self.base:g}: give a height, triangulated, plane or lowest")
+        if self.volume is None and self.base != "triangulated":
+            raise BadInput(f"--base {self.base}: it is of volumes; name the file of polygons too, --volume FILE")
+        if not 0 <= self.least_difference < float("inf"):
+            raise BadInput(f"--least-difference {self.least_difference:g}: it must be 0 or more")
         cache_bytes(self.memory, "--memory")
         if self.colors == "photographs" and "orthophoto" not in self.products:
             raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
@@ -120,6 +145,9 @@ class MapSettings:
             for package in ("rasterio", *PRODUCT_PACKAGES.get(name, ())):
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
+        if self.volume is not None:
+            with needed("pyogrio", "--volume"):
+                __import__("pyogrio")
         if self.colors == "photographs":
             require_simplification("simplifying a mesh")
 
@@ -154,12 +182,14 @@ def make_maps(
         refuse_apart(surface, grid)
     if other is not None:
         refuse_apart(other, grid)
+    polygons = [] if settings.volume is None else read_polygons(settings.volume, grid, frame.crs)
     done, unit = drawable(surface, settings), unit_of(frame)
-    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()))]
+    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()),
+             *(VOLUME_FILES if polygons else ()))]  # fmt: skip
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
-        seen(subject.views) if settings.colors == "photographs" else "",
+        seen(subject.views) if settings.colors == "photographs" else "", [each.as_lists() for each in polygons],
     )  # fmt: skip
     with workshop(out, (*files, MAPS_RECORD), key) as folder:
         replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
@@ -186,7 +216,9 @@ def make_maps(
             record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
         record |= draw_products(subject, settings, sheet, drawn, done)
         if other is not None:
-            record["difference"] = subtract(sheet, other, settings.tile, unit)
+            record["difference"] = subtract(sheet, other, settings, unit, least_of(settings, frame))
+        if polygons:
+            record["volumes"] = measure(sheet, polygons, settings, other is not None, least_of(settings, frame))
         record["files"] = files
         write_json(out / MAPS_RECORD, record)
         emit(FileWritten(out / MAPS_RECORD, "facts of the maps"))
@@ -285,12 +317,37 @@ def scatter(surface: SurfaceFile, sheet: GeoTiffSettings, spacing: float, classi
     return {"spacing": spacing, "points": sum(counts.values())} | ({} if classify is None else {"classes": counts})
 
 
-def subtract(sheet: GeoTiffSettings, other: SurfaceFile, side: int, unit: str) -> dict[str, Any]:
+def least_of(settings: MapSettings, frame: Frame) -> float:
+    """The least detectable difference, units of the input."""
+    return settings.least_difference / (frame.metres or 1.0)
+
+
+def measure(
+    sheet: GeoTiffSettings, polygons: list[AreaPolygon], settings: MapSettings, two_dates: bool, least: float
+) -> dict[str, Any]:
+    """Measure volumes, write them, and return what maps.json says of them."""
+    other = sheet.out / PRODUCT_FILES["other"] if two_dates else None
+
+    def made() -> dict[str, Any]:
+        found = measure_volumes(
+            sheet, sheet.out / PRODUCT_FILES["dsm"], other, polygons, VolumeSettings(settings.base, least)
+        )
+        write_volumes(sheet, polygons, found, *(PRODUCT_FILES[name] for name in VOLUME_FILES))
+        return volumes_record(found)
+
+    facts = sheet.once([PRODUCT_FILES[name] for name in VOLUME_FILES], made)
+    return {"polygons_file": str(settings.volume), **facts}
+
+
+def subtract(
+    sheet: GeoTiffSettings, other: SurfaceFile, settings: MapSettings, unit: str, least: float
+) -> dict[str, Any]:
     """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
+    side = settings.tile
     sheet.once([PRODUCT_FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, PRODUCT_FILES["other"])))
     heights = sheet.out / PRODUCT_FILES["dsm"], sheet.out / PRODUCT_FILES["other"]
     name = PRODUCT_FILES["difference"]
-    found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
+    found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side, least))))
     claim(sheet.out, PRODUCT_FILES["picture"])
     draw_difference(sheet.out / PRODUCT_FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}

@@ -16,6 +16,7 @@ PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.laz", "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
+    "volumes": "volumes.gpkg", "volumes-table": "volumes.csv",
 }  # fmt: skip
 MAPS_RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""

@@ -152,3 +152,23 @@ def test_without_rasterio_one_line_says_what_to_install(run, monkeypatch, capsys
     assert main(["maps", str(run)]) == 2
     said = capsys.readouterr().err
     assert "surfkit maps needs the package rasterio" in said and "surfkit[maps]" in said and said.count("\n") == 1
+
+
+def test_volumes_of_a_run_are_printed_and_lines_are_refused(run, tmp_path, capsys):
+    """Of the mesh 2 + x / 2 above 1, within a square of 4 about the middle; the other mesh lies 1 lower there."""
+    needs("pyogrio")
+    corners = [[-2, -2], [2, -2], [2, 2], [-2, 2], [-2, -2]]
+    words = ["maps", str(run), "--gsd", "0.1", "--up", "z", "--products", "hillshade", "--out", str(tmp_path / "m")]
+    for kind, places in (("Polygon", [corners]), ("LineString", corners)):
+        item = {"type": "Feature", "properties": {"Name": "yard"}, "geometry": {"type": kind, "coordinates": places}}
+        text = json.dumps({"type": "FeatureCollection", "crs": None, "features": [item]})
+        (tmp_path / f"{kind}.geojson").write_text(text)
+    area = ["--volume", str(tmp_path / "Polygon.geojson"), "--base", "1", "--against", str(run.parent / "other")]
+    assert main([*words, *area, "--least-difference", "0.5"]) == 0
+    said = capsys.readouterr()
+    assert "yard" in said.out and "fill" in said.out and "changes" in said.out and "as those of the map" in said.err
+    found = json.loads((tmp_path / "m/maps.json").read_text())["volumes"]
+    assert found["net"] == pytest.approx(16) and found["polygons"][0]["net_since"] == pytest.approx(16, rel=0.1)
+    assert {"volumes.csv", "volumes.gpkg"} <= {path.name for path in (tmp_path / "m").iterdir()}
+    assert main([*words, "--volume", str(tmp_path / "LineString.geojson")]) == 2
+    assert "only polygons have a volume" in capsys.readouterr().err
