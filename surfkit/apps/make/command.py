@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass, replace
+import shlex
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,7 @@ from surfkit.apps.make.quality import QUALITIES, QualityName
 from surfkit.apps.make.record import MAKE_RECORD, Delivery, MakeRecord, read_record
 from surfkit.apps.make.way import Way
 from surfkit.apps.prepare_photos import refuse_overlap
+from surfkit.cli.recipes import ARGV
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.lock import locked
@@ -62,9 +64,13 @@ class MakeCommand:
     """Device for training and rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
+    given: tyro.conf.Suppress[str] = ""
+
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise BadInput(f"--steps {self.steps}: give 1 or more")
+        if not self.given:  # the words of the command line are only known while it is parsed
+            object.__setattr__(self, "given", shlex.join(["surfkit", "make", *ARGV.get()]))
 
     def run(self) -> None:
         """Make the delivery, and print what is in it."""
@@ -118,7 +124,7 @@ class MakeCommand:
         now = MakeRecord(source, self.quality, dump(reading), versions=versions)
         before = read_record(self.out)
         if before is None:
-            return Delivery(self.out, now)
+            return Delivery(self.out, now, self.given)
         remedy = f"give the same again, or name another folder, or delete {self.out}"
         if before.input != now.input:
             raise BadInput(f"--out {self.out} was made of {before.input}, and this is {now.input}; {remedy}")
@@ -141,8 +147,8 @@ class MakeCommand:
                     f"--steps {self.steps}: the run in {self.out / 'run'} has {before.decisions.steps}, and cannot be "
                     "made shorter; give as many or more, or leave it out"
                 )
-            before.decisions = replace(before.decisions, steps=self.steps)
-        return Delivery(self.out, before)
+            before.decisions = before.decisions.longer(self.steps)
+        return Delivery(self.out, before, self.given)
 
 
 COMMAND = MakeCommand

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,13 @@ class Decisions:
     points: int | None = None
     forecast: Forecast | None = None
 
+    def longer(self, steps: int) -> Decisions:
+        """The same with another number of steps, whose time follows from what was measured."""
+        told = self.forecast
+        if told is not None:
+            told = replace(told, seconds=round(told.seconds * steps / self.steps, 1))
+        return replace(self, steps=steps, forecast=told)
+
 
 @dataclass
 class MakeRecord:
@@ -96,10 +103,11 @@ class Delivery:
     Args:
         out: The folder.
         record: What make.json says, or is to say.
+        command: That goes on.
     """
 
-    def __init__(self, out: Path, record: MakeRecord) -> None:
-        self.out, self.record = out, record
+    def __init__(self, out: Path, record: MakeRecord, command: str) -> None:
+        self.out, self.record, self.command = out, record, command
 
     def write(self) -> None:
         """Save make.json."""
@@ -131,7 +139,7 @@ class Delivery:
             step.files = tuple(path.relative_to(self.out).as_posix() for path in work())
             step.complete = True
         except (BadInput, Fault) as error:
-            error.args = (f"step {name}: {error}",)
+            error.args = (f"step {name}: {error}; finished steps are kept: then `{self.command}` goes on",)
             raise
         finally:
             if not (was_done and step.complete):  # to look whether it is finished is not counted

@@ -135,7 +135,7 @@ class Way:
         """Do a step whose command does all again when it is given again, unless it is finished."""
         if self.delivery.is_done(name, key):
             at = self._names.index(name) + 1
-            say(f"step {at} of {len(self._names)}: {name} is finished, in {folder}")
+            say(f"step {at} of {len(self._names)}: {name}: finished, in {folder}")
         else:
             self._step(name, folder, key, work)
 
@@ -152,7 +152,10 @@ class Way:
             record.decisions = decide(data, self.quality, self.steps, self.device, self.out / RUN)
         with bars():
             frame = read(data).frame
-        print_table(("plan", f"--quality {self.quality}"), rows(record.decisions))
+        surface = record.steps.get("surface")
+        if surface is None or not surface.complete:
+            print_table(("plan", f"--quality {self.quality}"), rows(record.decisions))
+            print(flush=True)
         if frame.crs is None:
             say("the data set is not georeferenced: mesh, maps and points have its local coordinates")
         return self.wanted.on(frame)
