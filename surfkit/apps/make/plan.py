@@ -151,7 +151,8 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
     if (told := decisions.forecast) is None:
         found.append(("time", "not known: nothing could be measured"))
     else:
-        found.append(("time", f"about {duration(told.seconds)} for the steps of optimisation; the rest comes on top"))
-        found.append(("memory", f"{size(told.memory_bytes)}, with photographs"))
-        found.append(("disk", f"{size(told.disk_bytes)} for the model"))
+        later = "depth maps, mesh, texture and maps come on top"
+        found.append(("time", f"about {duration(told.seconds)} for the steps of optimisation; {later}"))
+        found.append(("memory", f"{size(told.memory_bytes)} for the same; making the mesh may take more"))
+        found.append(("disk", f"{size(told.disk_bytes)} for the model; {later}"))
     return found
