@@ -7,6 +7,12 @@ from surfkit.core.hooks import LazyCommand, hookimpl
 def surfkit_commands():
     """The commands of surfkit, in the order of `surfkit --help`."""
     return {
+        "make": LazyCommand(
+            "surfkit.apps.make.command",
+            "Go the whole way: from photographs, or a data set, to textured mesh, maps, splats and report.",
+            goes_on=True,
+            memory_advice="smaller photographs (--longest, --scale) or --quality draft need less",
+        ),
         "train": LazyCommand(
             "surfkit.apps.train",
             "Train a model, and make its mesh, from photographs with known cameras.",

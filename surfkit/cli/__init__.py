@@ -36,8 +36,8 @@ from surfkit.core.signals import terminable
 COMMANDS: dict[str, LazyCommand] = importlib.import_module("surfkit.apps").surfkit_commands()
 """Those of surfkit. The folder stands above this one, and so is not imported by name."""
 BEGIN = (
-    "To begin, `surfkit prepare photos FOLDER` makes a data set of photographs or a video, and `surfkit doctor DATA` "
-    "checks one that is there."
+    "To begin, `surfkit make PHOTOS --out DELIVERY` goes the whole way. Step by step, `surfkit prepare photos FOLDER` "
+    "makes a data set of photographs or a video, and `surfkit doctor DATA` checks one that is there."
 )
 """What `surfkit --help` says to those who are new."""
 MORE = "`surfkit help COMMAND` tells more. `surfkit plugins` lists the commands that packages add."

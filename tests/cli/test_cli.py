@@ -102,7 +102,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["trian"], "no command 'trian'; did you mean 'train'? commands: train, train-block, mesh, maps, texture,"),
+        (["trian"], "no command 'trian'; did you mean 'train'? commands: make, train, train-block, mesh, maps,"),
         (["train", "recipe:discs"], "--data PATH missing; see surfkit train --help"),
         (["train", "--data", "d"], "no recipe chosen: add one of recipe:discs, recipe:balls"),
         (["train", "--pretrain.steps", "5"], "no recipe chosen: add one of recipe:discs, recipe:balls"),

@@ -1,0 +1,71 @@
+"""What of a delivery cannot be made here, or not of this scene: found before anything long begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from surfkit.apps.maps.make_maps import PRODUCTS, Product
+from surfkit.apps.maps.make_maps import MapSettings as Maps
+from surfkit.apps.maps.map_grid import map_crs
+from surfkit.apps.texture.texture_mesh import TextureSettings, refuse_unplaced
+from surfkit.core.check import BadInput
+from surfkit.mesh.simplify import require_simplification
+from surfkit.scene.scene import Frame
+
+INSTALL_LATER = "the same command adds what is missing, once it is installed"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is made of the mesh, and what is left out, with the reason.
+
+    Attributes:
+        texture: How the mesh is textured; None where it is not.
+        maps: Which maps are drawn; None where none are.
+        left_out: Reasons, by what is left out.
+    """
+
+    texture: TextureSettings | None
+    maps: Maps | None
+    left_out: dict[str, str]
+
+    def on(self, frame: Frame) -> Wanted:
+        """What can be made of a scene in this frame: its coordinate reference system may have no place for some."""
+        texture, maps, left_out = self.texture, self.maps, dict(self.left_out)
+        if texture is not None:
+            try:
+                refuse_unplaced(frame, texture.geoid)
+            except BadInput as error:
+                left_out["3D Tiles"] = str(error)
+                texture = TextureSettings(formats=("obj", "glb"))
+        if maps is not None:
+            try:
+                map_crs(frame)
+            except BadInput as error:
+                left_out["maps"] = str(error)
+                maps = None
+        return Wanted(texture, maps, left_out)
+
+
+def wanted() -> Wanted:
+    """What can be made with the packages that are installed."""
+    left_out: dict[str, str] = {}
+    texture: TextureSettings | None = TextureSettings()
+    try:
+        require_simplification("surfkit texture")
+    except BadInput as error:
+        left_out["texture"], texture = f"{error}; {INSTALL_LATER}", None
+    try:
+        Maps(products=()).refuse_missing()
+    except BadInput as error:
+        left_out["maps"] = f"{error}; {INSTALL_LATER}"
+        return Wanted(texture, None, left_out)
+    products: list[Product] = []
+    for name in PRODUCTS:
+        try:
+            Maps(products=(name,)).refuse_missing()
+        except BadInput as error:
+            left_out[name] = f"{error}; {INSTALL_LATER}"
+        else:
+            products.append(name)
+    return Wanted(texture, Maps(products=tuple(products)), left_out)
