@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import warnings
 from collections.abc import Callable, Iterator
@@ -137,10 +136,10 @@ def _system(path: Path, text: str | None) -> CRS | None:
     """The coordinate reference system of a file; None for one that has none, or a local one."""
     if path.suffix.lower() in GEOJSON_ENDINGS:
         try:
-            head = json.loads(path.read_text(encoding="utf-8-sig"))
-        except ValueError as error:  # GDAL reads some of what is no JSON
+            head = from_json(path.read_text(encoding="utf-8-sig"))
+        except (BadInput, ValueError) as error:  # GDAL reads some of what is no JSON
             raise BadInput(f"{path}: no sound JSON: {error}; export it again") from error
-        if "crs" in head and head["crs"] is None:  # none, by the version of 2008; GDAL takes it as left out
+        if isinstance(head, dict) and "crs" in head and head["crs"] is None:  # none, by the version of 2008; GDAL takes it as left out
             return None
     if text is None:
         return None
