@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from surfkit.apps.maps.make_maps import PRODUCTS, Product
+from surfkit.apps.maps.make_maps import USUAL_PRODUCTS, Product
 from surfkit.apps.maps.make_maps import MapSettings as Maps
 from surfkit.apps.maps.map_grid import map_crs
 from surfkit.apps.texture.texture_mesh import TextureSettings, refuse_unplaced
@@ -61,7 +61,7 @@ def wanted() -> Wanted:
         left_out["maps"] = f"{error}; {INSTALL_LATER}"
         return Wanted(texture, None, left_out)
     products: list[Product] = []
-    for name in PRODUCTS:
+    for name in USUAL_PRODUCTS:
         try:
             Maps(products=(name,)).refuse_missing()
         except BadInput as error:

@@ -36,7 +36,7 @@ class PieceEnds:
         """Note the open lines of a tile; where one ends, its neighbour's goes on, so lines must have a direction."""
         for number, (level, line) in enumerate(lines):
             if not is_closed(line):
-                start, end = (np.float64([level, *line[at]]).tobytes() for at in (0, -1))
+                start, end = (np.array([level, *line[at]]).tobytes() for at in (0, -1))
                 self.starts.setdefault(start, []).append(len(self.pieces))
                 self.ends.append(end)
                 self.pieces.append((tile, number))

@@ -16,6 +16,7 @@ from pyproj.exceptions import CRSError
 from surfkit.apps.maps.map_grid import MapGrid, shown
 from surfkit.apps.maps.polygon_checks import refuse_crossing, signed_area
 from surfkit.core.check import BadInput, few
+from surfkit.core.codec import from_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.scene.crs import TOPOCENTRIC, degrees_of, exact, in_plan, missing, not_installed, parsed
@@ -139,8 +140,8 @@ def _system(path: Path, text: str | None) -> CRS | None:
             head = from_json(path.read_text(encoding="utf-8-sig"))
         except (BadInput, ValueError) as error:  # GDAL reads some of what is no JSON
             raise BadInput(f"{path}: no sound JSON: {error}; export it again") from error
-        if isinstance(head, dict) and "crs" in head and head["crs"] is None:  # none, by the version of 2008; GDAL takes it as left out
-            return None
+        if isinstance(head, dict) and "crs" in head and head["crs"] is None:
+            return None  # by the version of 2008; GDAL takes it as left out
     if text is None:
         return None
     try:
