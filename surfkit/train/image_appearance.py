@@ -71,7 +71,7 @@ class ImageAppearance:
         return self.model(joined(own, *shared) if shared else own, color, self.camera)
 
     def add(self, grads: Sequence[Tensor | None]) -> None:
-        """Add gradients by `leaves`, those of some of the losses."""
+        """Add gradients of some of the losses by `leaves`: of the photograph's numbers, (...), and the shared (S,)."""
         both = zip(self.grads, grads, strict=True)
         self.grads = [b if a is None else a if b is None else a + b for a, b in both]
 

@@ -149,8 +149,9 @@ def test_rows_that_make_a_mesh_alone_are_run_where_meshes_are_compared(data, tmp
     assert every["stereo alone"].depth is not None, "it makes the depth maps that it fuses"
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("name", [name for name in TABLES if name != "appearance"])
 def test_every_table_has_stereo_alone_as_its_baseline(name):
+    """Of appearances, which are measured by colours, stereo has none."""
     found = [recipe for recipe in build(TABLES[name]).values() if recipe.method == STEREO.method]
     assert len(found) == 1 and found[0].depth == STEREO.depth
 
