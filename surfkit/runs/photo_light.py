@@ -19,7 +19,7 @@ from surfkit.core.registry import name_of
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
 from surfkit.raster.api import Maps
-from surfkit.runs.folder import Run
+from surfkit.runs.folder import Run, RunStage
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
@@ -97,10 +97,13 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
     if tracks.is_empty:
         say("light of the photographs: not known, as nothing tells which show which points; colours stay as they are")
         return LightRecord({}, {}, 0.0, None, is_used=False)
-    if not is_wanted and not (spread := spread_of(sampled(scene.train), tracks)).is_uneven:
+    views = scene.train if is_wanted else sampled(scene.train)
+    light = light_by_tracks(views, tracks)
+    if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
         say(f"light of the photographs: {spread}; that is little, so colours stay as they are")
         return LightRecord({}, {}, 0.0, spread, is_used=False)
-    light = fit_light(track_colors(scene.train, tracks), rows_of(scene.train))
+    if len(views) < len(scene.train):
+        light = light_by_tracks(scene.train, tracks)
     say(f"light of the photographs: {LightSpread.of(light)}; colours are compared in the light of each")
     if unknown := [view.name for view, seen in zip(scene.train, light.seen, strict=True) if seen < MIN_SEEN]:
         emit(
@@ -117,7 +120,7 @@ def warn_of_light(run: Run, scene: Scene) -> None:
     settings = run.recipe.without_appearance
     if not settings or (tracks := observations(run.data, scene)).is_empty:
         return
-    if (spread := spread_of(sampled(scene.train), tracks)).is_uneven:
+    if (spread := LightSpread.of(light_by_tracks(sampled(scene.train), tracks))).is_uneven:
         emit(Warned(spread.remedy(True, settings)))
 
 
@@ -129,9 +132,9 @@ def sampled(views: Sequence[View]) -> Sequence[View]:
     return tuple(view for start in starts for view in views[start : start + GROUP])
 
 
-def spread_of(views: Sequence[View], tracks: Observations) -> LightSpread:
-    """How far the light of some photographs differs."""
-    return LightSpread.of(fit_light(track_colors(views, tracks), rows_of(views)))
+def light_by_tracks(views: Sequence[View], tracks: Observations) -> TrackLight:
+    """The light of some photographs, from the sparse points that they show."""
+    return fit_light(track_colors(views, tracks), rows_of(views))
 
 
 def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:
@@ -184,13 +187,22 @@ def light_of(run: Run, views: Sequence[View]) -> PhotoLight | None:
     return _photo_light([one.stops for one in photographs], [record.cameras[one.camera] for one in photographs])
 
 
-def held_out_response(run: Run) -> Callable[[View, Maps], Maps] | None:
+def held_out_response(run: Run, stage: RunStage) -> Callable[[View, Maps], Maps] | None:
     """What turns maps of held-out views into what the cameras of light.json take: with vignetting and response curve.
 
-    Their exposure is that of the mean photograph: only they could tell theirs, and they are measured against. None
-    where nothing is known of any camera.
+    Their exposure is that of the mean photograph: only they could tell theirs, and they are measured against. Views of
+    a camera that took no photograph that is trained on stay as they are.
+
+    Args:
+        run: Whose light.json it is.
+        stage: Whose model is drawn. One that learns from renders has the light of the stage before.
+
+    Returns:
+        None where nothing is known of any camera.
     """
-    model = run.last.stage.appearance if run.recipe.has_stages else None
+    stages = run.stages[: 1 + [each.name for each in run.stages].index(stage.name)]
+    seeing = (each for each in reversed(stages) if each.refine is None or not each.refine.taught)
+    model = next(seeing).stage.appearance
     if model is None or not model.needs_light or not run.light.exists():
         return None
     cameras = read_json(run.light, LightRecord).cameras

@@ -357,7 +357,7 @@ def optimised(run: Run, state: StageState) -> Reconstruction:
         cpu_seconds=state.cpu_seconds,
         peak_memory_bytes=state.peak_memory_bytes,
         peak_gpu_bytes=state.peak_gpu_bytes,
-        respond=held_out_response(run),
+        respond=held_out_response(run, last),
     )
 
 

@@ -58,7 +58,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     def made() -> Reconstruction:  # made when it is needed, as its activated values take memory
         model = SplatModel(before.primitive, before.stage.finished(given), given.sh_degree, before.stage.near)
-        return with_drawing(Reconstruction(splats=model, respond=held_out_response(run)), ctx.rasterizer)
+        return with_drawing(Reconstruction(splats=model, respond=held_out_response(run, before)), ctx.rasterizer)
 
     def start(_: torch.Generator) -> InitialModel:
         found = made()

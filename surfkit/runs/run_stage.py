@@ -235,7 +235,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     at, intervals, meter = job.stage, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
     emit(StageBegan(at.name, steps, len(state.points), state.index + 1, at.block))
-    clock, draw, respond = Stopwatch(state), live_drawing(job, trainer, state), held_out_response(job.run)
+    clock, draw, respond = Stopwatch(state), live_drawing(job, trainer, state), held_out_response(job.run, job.stage)
 
     def taken(view: View) -> Maps:
         maps = drawn_now(trainer, state, view)

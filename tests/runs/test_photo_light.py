@@ -18,13 +18,14 @@ from surfkit.raster.psnr import psnr
 from surfkit.runs import photo_light, pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
-from surfkit.runs.photo_light import LightRecord, light_of
+from surfkit.runs.photo_light import LightRecord, held_out_response, light_of
 from surfkit.runs.pipeline import load_run, loaded, opened, run
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.photos import view_photo
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
+from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover
 from surfkit.train.stage import Stage
 
 NOTHING = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
@@ -179,3 +180,12 @@ def test_held_out_photographs_are_drawn_as_their_camera_takes_them(recipe, tmp_p
         assert np.abs(stops[:, 24, 32]).max() < 0.1 and -2.0 < np.median(stops[:, 0, 0]) < -1.0
         wanted, photo = read_json(tmp_path / "run/metrics.json", dict[str, Any]), view_photo(view).float() / 255
         assert wanted["images"]["per_image"][view.name]["psnr"] == pytest.approx(psnr(taken.clamp(0, 1), photo), 1e-4)
+
+
+def test_a_model_has_the_light_of_the_stage_that_saw_photographs(data, recipe, tmp_path):
+    """One that learns from renders does not; one that is refined on photographs as they are has theirs."""
+    short = replace(recipe, pretrain=replace(recipe.pretrain, steps=1))
+    run(short, data, tmp_path, Compute("cpu"), EVERY)
+    refined = Run(tmp_path, replace(short, refine=(DistilSH(), PruneAndRecover())), data)
+    found = {stage.name: held_out_response(refined, stage) for stage in refined.stages}
+    assert found["pretrain"] is not None and found["refine0"] is not None and found["refine1"] is None

@@ -1,4 +1,4 @@
-"""Pieces of lines that were cut where tiles meet, put together again in bounded memory."""
+"""Pieces of lines that were cut where tiles meet, put together again with only their ends in memory."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ class PieceEnds:
         pieces: Tile and number in it of each.
         follows: Piece that begins where another ends, by that one's number.
         starts: Pieces by level and the place where they begin, as bytes, until they follow one.
+        ends: Level and place where each ends, as bytes.
     """
 
     pieces: list[tuple[int, int]] = field(default_factory=list)

@@ -284,6 +284,7 @@ METHODS_TABLE = Table(
         ),
         Row(
             "CityGaussianV2",
+            {"pretrain.appearance": None, "tune.appearance": None},  # as published, and as the rows above
             recipe=RECIPES["citygs2"],
             kept=False,
             paper=compared(0.765, 24.51, 0.215, 0.576, 0.450, 0.501),
