@@ -10,27 +10,33 @@ import tyro
 
 from surfkit.apps.maps.make_maps import MAPS_RECORD, MapSettings, make_maps
 from surfkit.apps.maps.map_grid import same_crs
+from surfkit.apps.maps.precision import StereoDepths
 from surfkit.apps.maps.volume_table import show_volumes
+from surfkit.apps.texture.texture_cache import seen
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.core.stages import key_of
 from surfkit.evaluate.geometry.file_transform import same_plan
 from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_mesh, read_surface, system_of
 from surfkit.evaluate.geometry.top_surface import highest
+from surfkit.io.datasets.depth_prior import prior_files, read_priors
 from surfkit.runs.command import refuse_no_mesh
+from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import opened
 from surfkit.runs.resume import read_unchanged
 from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import note_held_out
-from surfkit.scene.scene import Frame
+from surfkit.scene.available_memory import cache_bytes
+from surfkit.scene.scene import Frame, Scene
 from surfkit.train.progress_bars import bars
 
 
 @dataclass(frozen=True)
 class MapsCommand:
     """Draw maps of the mesh of a finished run: surface model, orthophoto, hillshade, contour lines, point cloud,
-    and terrain without buildings and trees.
+    expected errors of heights, and terrain without buildings and trees.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
     --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs
@@ -74,7 +80,8 @@ class MapsCommand:
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(self.against, frame)
-            record = make_maps(MeshWithPhotos(surface, frame, scene.train), self.settings, out, other)
+            depths = stereo_depths(run, scene, self.settings) if "precision" in self.settings.products else None
+            record = make_maps(MeshWithPhotos(surface, frame, scene.train), self.settings, out, other, depths)
             note_held_out(run, scene)
         show(out, record)
 
@@ -99,6 +106,23 @@ class MapsCommand:
         if frame.crs is None:
             emit(Warned("neither run is georeferenced; their coordinates are taken to be the same"))
         return read_mesh(run.mesh)
+
+
+def stereo_depths(run: Run, scene: Scene, settings: MapSettings) -> StereoDepths | None:
+    """The depth maps that a run was trained with; None where there are none."""
+    priors = read_priors(run.data, scene, cache_bytes(settings.memory, "--memory"))
+    if priors is None:
+        return None
+    if run.data.priors is None:
+        emit(
+            Warned(
+                "--products precision: the depth maps are those of the data set; errors are foretold for maps of "
+                "`surfkit prepare depth` with estimator:patch-match, and may be wrong for others"
+            )
+        )
+    states = [(name, file.path.stat()) for name, file in sorted(prior_files(run.data, scene).items())]
+    files = [[name, state.st_size, state.st_mtime_ns] for name, state in states]
+    return StereoDepths(priors, key_of(files, seen(scene.train)))
 
 
 def heights_of(path: Path) -> SurfaceFile:
@@ -132,6 +156,14 @@ def show(out: Path, record: dict[str, Any]) -> None:
         rows.append(("ground that is seen", f"{found['ground_seen']:.1%} of the surface"))
         told = f"{found['without_terrain']:.1%} of it: no ground within {found['reach']:g} {unit}"
         rows.append(("without terrain", told))
+    if found := record.get("precision"):
+        told = (
+            f"median {found['median']:.3g}, 90 % under {found['percentile_90']:.3g} {unit}" if found["known"] else "-"
+        )
+        rows += [
+            ("expected error of a height", told),
+            ("not confirmed by two photographs", f"{1 - found['known']:.1%} of the surface; no error is known there"),
+        ]
     if found := record.get("difference"):
         rows += [
             ("above (fill)", f"{found['fill']:,.6g} {unit}³ on {found['area']:,.6g} {unit}² compared"),

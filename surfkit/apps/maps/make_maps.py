@@ -19,6 +19,7 @@ from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
 from surfkit.apps.maps.orthophoto import OrthophotoColors
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
 from surfkit.apps.maps.polygon_file import AreaPolygon, read_polygons
+from surfkit.apps.maps.precision import Rays, StereoDepths, write_precision
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
 from surfkit.apps.maps.volume_base import BaseKind
@@ -40,12 +41,12 @@ from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes, up_direction
 
-Product = Literal["orthophoto", "hillshade", "contours", "points", "terrain"]
-PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points", "terrain")
+Product = Literal["orthophoto", "hillshade", "contours", "points", "precision", "terrain"]
+PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points", "precision", "terrain")
 USUAL_PRODUCTS: tuple[Product, ...] = PRODUCTS[:4]
-"""All but the terrain, which is a guess with settings of its own."""
-TERRAIN_FILES = ("terrain", "above", "ground")
-"""Files of a terrain model."""
+"""All but the terrain, which is a guess with settings of its own, and the precision, which needs depth maps."""
+SEVERAL_FILES = {"precision": ("precision", "rays"), "terrain": ("terrain", "above", "ground")}
+"""Files of products that are more than one."""
 COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
 SHORTEST_CELLS = 30
@@ -62,7 +63,8 @@ class MapSettings:
 
     products: tuple[Product, ...] = USUAL_PRODUCTS
     """What to write beside the surface model (dsm.tif). `terrain` is the ground without buildings and trees, heights
-    above it, and classes of the points."""
+    above it, and classes of the points; `precision` is the expected error of each height, and needs the depth maps that
+    the run was trained with."""
 
     gsd: Length = "auto"
     """Side of a cell (ground sampling distance), metres; in units of the data set where it does not say how long these
@@ -94,7 +96,8 @@ class MapSettings:
     means of photographs or of renders."""
 
     memory: str = "auto"
-    """Memory for photographs, such as 4GB, with --colors photographs; auto is half of the free memory."""
+    """Memory for photographs, such as 4GB, with --colors photographs, and for depth maps, with `--products precision`;
+    auto is half of the free memory."""
 
     terrain: TerrainSettings = TerrainSettings()
     """How the ground is found, with `--products terrain`."""
@@ -136,8 +139,8 @@ class MapSettings:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the files in PRODUCT_FILES, the surface model first."""
-        chosen = (name for name in PRODUCTS if name in self.products and name != "terrain")
-        return ("dsm", *chosen, *(TERRAIN_FILES if "terrain" in self.products else ()))
+        chosen = (SEVERAL_FILES.get(name, (name,)) for name in PRODUCTS if name in self.products)
+        return ("dsm", *(name for names in chosen for name in names))
 
     def refuse_missing(self) -> None:
         """BadInput if a package is missing, before anything is done."""
@@ -153,7 +156,11 @@ class MapSettings:
 
 
 def make_maps(
-    subject: MeshWithPhotos, settings: MapSettings, out: Path, other: SurfaceFile | None = None
+    subject: MeshWithPhotos,
+    settings: MapSettings,
+    out: Path,
+    other: SurfaceFile | None = None,
+    depths: StereoDepths | None = None,
 ) -> dict[str, Any]:
     """Write the maps of a mesh into a folder, and return what maps.json says: lengths are in units of the input.
 
@@ -163,6 +170,7 @@ def make_maps(
         out: The folder; maps of surfkit in it are replaced, all other files stay. What an interrupted call has finished
             for the same maps is in it, and is not done again.
         other: A mesh in the same coordinates, to subtract.
+        depths: What the photographs know of depth, for the precision.
 
     Raises:
         BadInput: A package is missing, there is nothing to draw, or the map would be too large.
@@ -174,6 +182,11 @@ def make_maps(
         raise BadInput(
             "--products terrain: it needs lengths in metres, and the data set does not say how long its unit is; give "
             "--metres-per-unit (1 if its coordinates are metres)"
+        )
+    if "precision" in settings.products and depths is None:
+        raise BadInput(
+            "--products precision: the run has no depth maps of its photographs, which it is told from; train with a "
+            "recipe that uses them, such as recipe:surface, or leave it out"
         )
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
@@ -189,7 +202,9 @@ def make_maps(
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
-        seen(subject.views) if settings.colors == "photographs" else "", [each.as_lists() for each in polygons],
+        seen(subject.views) if settings.colors == "photographs" else "",
+        depths.key if depths is not None and "precision" in settings.products else "",
+        [each.as_lists() for each in polygons],
     )  # fmt: skip
     with workshop(out, (*files, MAPS_RECORD), key) as folder:
         replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
@@ -215,6 +230,8 @@ def make_maps(
         if "orthophoto" in done and settings.colors == "photographs":
             record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
         record |= draw_products(subject, settings, sheet, drawn, done)
+        if "precision" in done and depths is not None:
+            record["precision"] = estimate_precision(subject, depths, sheet, settings.tile)
         if other is not None:
             record["difference"] = subtract(sheet, other, settings, unit, least_of(settings, frame))
         if polygons:
@@ -285,7 +302,7 @@ def draw_products(
         record["contours"] = sheet.once([name], lambda: trace(sheet, interval, least, settings.tile))
     classify = None
     if "terrain" in done:
-        names = [PRODUCT_FILES[name] for name in TERRAIN_FILES]
+        names = [PRODUCT_FILES[name] for name in SEVERAL_FILES["terrain"]]
         ground = find_ground(subject.surface, sheet, PRODUCT_FILES["dsm"], settings.terrain, 1 / units)
         record["terrain"] = sheet.once(
             names, lambda: write_terrain(sheet, ground, PRODUCT_FILES["dsm"], names, settings.tile)
@@ -297,6 +314,16 @@ def draw_products(
             [PRODUCT_FILES["points"]], lambda: scatter(subject.surface, sheet, spacing, classify)
         )
     return record
+
+
+def estimate_precision(
+    subject: MeshWithPhotos, depths: StereoDepths, sheet: GeoTiffSettings, side: int
+) -> dict[str, Any]:
+    """Write the expected errors of the surface model, and return what maps.json says of them."""
+    names = [PRODUCT_FILES[name] for name in SEVERAL_FILES["precision"]]
+    pixel = ground_sampling_distance(subject.surface, subject.views, subject.frame)
+    rays = Rays(subject.views, depths.priors, subject.frame, sheet.grid, pixel)
+    return sheet.once(names, lambda: write_precision(sheet, rays, PRODUCT_FILES["dsm"], names, side))
 
 
 def shade(sheet: GeoTiffSettings, side: int) -> dict[str, Any]:

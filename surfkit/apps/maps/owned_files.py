@@ -14,7 +14,8 @@ from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 
 PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
-    "points": "points.laz", "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
+    "points": "points.laz", "precision": "precision.tif", "rays": "rays.tif",
+    "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
     "volumes": "volumes.gpkg", "volumes-table": "volumes.csv",
 }  # fmt: skip
