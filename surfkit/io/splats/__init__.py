@@ -16,6 +16,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     from surfkit.io.splats.sog import SOG
     from surfkit.io.splats.splat import Splat
     from surfkit.io.splats.spz import SPZ
+    from surfkit.io.splats.streamed_sog import StreamedSOG
     from surfkit.io.splats.tiles3d import Tiles3D
 
     return {
@@ -26,5 +27,6 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "sog": SOG,
         "splat": Splat,
         "spz": SPZ,
+        "streamed-sog": StreamedSOG,
         "tiles3d": Tiles3D,
     }

@@ -63,8 +63,19 @@ class SOG(Format):
         """See `Format.write`."""
         table.refuse_unsound(path)
         table = replace(table, means=table.file_means(frame)).on_cpu()
-        order = morton_order(table.means.double().numpy())
         self._warn(path, table)
+        with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for name, data in self.files(table, morton_order(table.means.double().numpy()), frame):
+                archive.writestr(zipfile.ZipInfo(name), data)
+
+    def files(self, table: SplatTable, order: np.ndarray, frame: Frame | None) -> Iterator[tuple[str, bytes]]:
+        """Names and contents of the files of splats, meta.json last.
+
+        Args:
+            table: On the CPU, without the shift of the frame.
+            order: (N,) rows of it, in the order that they are to be stored in.
+            frame: That of the input, if the table is in it.
+        """
         meta: dict[str, Any] = {
             "version": 2,
             "asset": {"generator": f"surfkit {own_version()}"},
@@ -73,12 +84,11 @@ class SOG(Format):
             **({"model": "antialiased", "antialias": True} if table.antialias else {}),
             **({"surfkit": _frame_facts(frame)} if frame else {}),
         }
-        with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for key, facts, images in self._groups(table, order):
-                meta[key] = facts | {"files": list(images)}
-                for name, pixels in images.items():
-                    archive.writestr(zipfile.ZipInfo(name), _webp(pixels, self.effort))
-            archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+        for key, facts, images in self._groups(table, order):
+            meta[key] = facts | {"files": list(images)}
+            for name, pixels in images.items():
+                yield name, _webp(pixels, self.effort)
+        yield "meta.json", json.dumps(meta).encode()
 
     def _groups(self, table: SplatTable, order: np.ndarray) -> Iterator[tuple[str, dict, dict[str, np.ndarray]]]:
         """The entries of meta.json with the images that belong to them."""

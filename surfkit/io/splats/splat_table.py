@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -168,6 +169,12 @@ class SplatTable:
     def take(self, rows: Tensor | slice) -> SplatTable:
         """The splats of a mask, of indices or of a slice."""
         return replace(self, **{name: getattr(self, name)[rows] for name in SPLAT_COLUMNS})
+
+
+def joined(tables: Sequence[SplatTable]) -> SplatTable:
+    """The splats of some tables of the same kind and degree, one table after the other."""
+    columns = {name: torch.cat([getattr(table, name) for table in tables]) for name in SPLAT_COLUMNS}
+    return replace(tables[0], **columns)
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class Tiles3D(Format):
         place = self._place(path, frame)
         root = tree or Tile(table, *_corners(table))
         with replacing_folder(path) as folder:
-            tiles = _divided(root, self.most_splats)
+            tiles = divided(root, self.most_splats)
             written, _ = _written(folder, tiles, "0", place, self.compress)
             write_json(folder / INDEX, self._index(written, place))
 
@@ -153,7 +153,7 @@ def box_of(table: SplatTable) -> np.ndarray:
     return np.stack([(means - reach).amin(0).numpy(), (means + reach).amax(0).numpy()])
 
 
-def _divided(tile: Tile, most: int) -> Tile:
+def divided(tile: Tile, most: int) -> Tile:
     """The same tree without leaves of more than `most` splats.
 
     Raises:
@@ -169,7 +169,7 @@ def _divided(tile: Tile, most: int) -> Tile:
             f"a tile of a coarse level has {len(tile.splats)} splats; most_splats is {most}: raise it, or build the "
             "levels of detail with smaller tiles"
         )
-    children = [_divided(child, most) for child in tile.children]
+    children = [divided(child, most) for child in tile.children]
     flat = [part for child in children for part in (child.children if _is_group(child) else [child])]
     return replace(tile, children=tuple(flat))
 
