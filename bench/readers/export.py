@@ -24,6 +24,8 @@ def variants() -> dict[str, Format]:
         made["model.z.glb"] = replace(found["gltf"](), up="z")
     if "tiles3d" in found:
         made["model.tiles"] = found["tiles3d"](georeference=False, most_splats=8_000)
+    if "streamed-sog" in found:
+        made["model.stream"] = found["streamed-sog"](chunk_splats=8_000, leaf_splats=2_000)
     return made
 
 

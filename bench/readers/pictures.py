@@ -24,12 +24,16 @@ HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of PLY files to those of SPZ files, right-up-back."""
 
 VIEWERS = {
-    "playcanvas": r"\.(ply|sog|glb)$|\.v4\.(same\.)?spz$",
+    "playcanvas": r"\.(ply|sog|glb|stream)$|\.v4\.(same\.)?spz$",
     "spark": r"\.(ply|sog|splat)$|\.v[23]\.spz$",
     "cesium": r"\.tiles$",
 }
 """Names of the files that each viewer draws. PlayCanvas reads version 4 of SPZ only, Spark 2.2 versions up to 3, and
 CesiumJS 1.145 only 3D Tiles with SPZ inside."""
+
+
+INDEX_FILES = {".tiles": "tileset.json", ".stream": "lod-meta.json"}
+"""What viewers open of a folder."""
 
 
 def suits(viewer: str, path: Path) -> bool:
@@ -63,7 +67,7 @@ def drawn(folder: Path, run: Path) -> list[Row]:
     for viewer in VIEWERS:
         for path in sorted(folder.glob("model.*"), key=lambda p: (p.name != "model.ply", p.name)):
             if suits(viewer, path):
-                name = f"{path.name}/tileset.json" if path.is_dir() else path.name
+                name = f"{path.name}/{INDEX_FILES[path.suffix]}" if path.is_dir() else path.name
                 camera = camera_of(row, world_of(path))
                 shots.append(
                     {"viewer": viewer, "file": name, "camera": camera, "out": str(folder / f"{viewer}.{path.name}.png")}

@@ -11,7 +11,7 @@ const here = path.dirname(fileURLToPath(import.meta.url));
 const { chromium, folder, shots } = JSON.parse(fs.readFileSync(process.argv[2], "utf8"));
 const ROOTS = { pages: path.join(here, "pages"), modules: path.join(here, "node_modules"), files: path.resolve(folder) };
 const TYPES = { ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript", ".json": "application/json",
-  ".wasm": "application/wasm", ".css": "text/css", ".glb": "model/gltf-binary" };
+  ".wasm": "application/wasm", ".css": "text/css", ".glb": "model/gltf-binary", ".webp": "image/webp" };
 
 const server = http.createServer((request, response) => {
   const [, root, ...rest] = decodeURIComponent(new URL(request.url, "http://x").pathname).split("/");

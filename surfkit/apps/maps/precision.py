@@ -296,8 +296,8 @@ def _share_below(tiles: Sequence[dict[str, int]], share: float) -> float | None:
         for name, size in classes.items():
             total[int(name)] = total.get(int(name), 0) + size
     rank, seen = share * sum(total.values()), 0
-    for name, size in sorted(total.items()):
+    for step, size in sorted(total.items()):
         seen += size
         if seen >= rank:
-            return float(HISTOGRAM_STEP**name)
+            return float(HISTOGRAM_STEP**step)
     return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -173,7 +173,7 @@ class SplatTable:
 
 def joined(tables: Sequence[SplatTable]) -> SplatTable:
     """The splats of some tables of the same kind and degree, one table after the other."""
-    columns = {name: torch.cat([getattr(table, name) for table in tables]) for name in SPLAT_COLUMNS}
+    columns: dict[str, Any] = {n: torch.cat([getattr(table, n) for table in tables]) for n in SPLAT_COLUMNS}
     return replace(tables[0], **columns)
 
 
