@@ -118,6 +118,7 @@ def show(out: Path, record: dict[str, Any]) -> None:
         ("up", record["up"]),
         ("ground sampling distance", f"{record['gsd']:g} {unit}"),
         ("size", "{} x {} cells".format(*record["size"])),
+        *([("area", f"{found['area']:,.6g} {unit}², from {found['file']}")] if (found := record.get("area")) else []),
         ("covered", f"{record['covered']:.1%}"),
         ("heights", "{:.2f} to {:.2f} {}".format(*record["heights"], unit)),
     ]
