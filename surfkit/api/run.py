@@ -31,8 +31,9 @@ from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import note_metrics
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_levels import load_levels
-from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.make_mesh import make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.run_method import refuse_mesher, refuse_not_drawn, splats_of

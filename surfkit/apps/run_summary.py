@@ -191,6 +191,7 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
             f"{cleaning['boundary_share']:.1%} of all edges, in {cleaning['boundaries']:,} loops",
         ),
         *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
+        *([("within", record["area"]["file"])] if "area" in record else []),
         *_finishing_rows(record),
         *(
             (in_words(name.replace("_", " ")), in_words(value))
