@@ -308,6 +308,7 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     where = "all" if crop is None else f"area {crop['area']:.4g}, heights {crop['low']:.4g} to {crop['high']:.4g}"
     rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
     rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
+    rows += [("within", found["area"]["file"])] if found.get("area") else []
     if outside := found.get("outside"):  # not in metrics of older versions
         shares = ", ".join(f"{share:.1%} {name}" for name, share in outside.items())
         rows.append(("outside of it", f"{shares}: not measured"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +25,13 @@ class Area:
         path: The file.
         polygons: How many it has.
         shape: Of shapely: easting and northing, units of the data set.
-        turn: (3, 3) float64 unit vectors in rows: east, north and up in the frame of the input.
+        plan: (2, 4) float64: easting and northing of x, y, z, 1 in the frame of the points that are asked for.
     """
 
     path: Path
     polygons: int
     shape: BaseGeometry
-    turn: np.ndarray
+    plan: np.ndarray
 
     @property
     def bounds(self) -> Bounds:
@@ -53,8 +53,12 @@ class Area:
         return shapely.contains_xy(self.shape, *places.T)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: which of (n, 3) positions in the frame of the input lie in it."""
-        return self.contains(points @ self.turn[:2].T)
+        """(n,) bool: which of (n, 3) positions lie in it."""
+        return self.contains(points @ self.plan[:, :3].T + self.plan[:, 3])
+
+    def moved(self, matrix: np.ndarray) -> Area:
+        """The same for positions in another frame, to which a (4, 4) matrix leads from the one before."""
+        return replace(self, plan=self.plan @ np.linalg.inv(matrix))
 
     def record(self) -> dict[str, Any]:
         """What files with facts say of it; the area in square units of the data set."""
@@ -77,11 +81,12 @@ def read_area(path: Path, site: Site, turn: np.ndarray) -> Area:
     found = read_polygons(Path(path), AREA_OPTION, site)
     import shapely
 
-    return Area(Path(path), len(found), shapely.union_all([each.shape for each in found]), turn)
+    plan = np.column_stack([turn[:2], np.zeros(2)])
+    return Area(Path(path), len(found), shapely.union_all([each.shape for each in found]), plan)
 
 
 def bounds_of(blocks: Iterable[np.ndarray], turn: np.ndarray) -> Bounds:
-    """West, south, east and north of blocks of (n, 3) positions in the frame of the input; `turn` as in `Area`."""
+    """West, south, east and north of blocks of (n, 3) positions in the frame of the input; `turn` as in `read_area`."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for block in blocks:
         placed = (block @ turn.T)[:, :2] if len(block) else np.empty((0, 2))
