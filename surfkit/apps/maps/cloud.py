@@ -70,7 +70,7 @@ def write_cloud(
             places = sheet.grid.to_map(places)
             inside = ((places[:, :2] >= [west, south]) & (places[:, :2] <= [east, north])).all(1)
             if sheet.grid.area is not None:
-                inside[inside] = sheet.grid.area.contains(places[inside, :2])
+                inside = inside & sheet.grid.area.contains(places[:, :2])
             record = laspy.ScaleAwarePointRecord.zeros(int(inside.sum()), header=header)
             record.x, record.y, record.z = places[inside].T
             record.return_number[:] = record.number_of_returns[:] = 1

@@ -33,10 +33,10 @@ class MapsCommand:
     and terrain without buildings and trees.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
-    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs
-    `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`,
-    `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same command goes on where
-    it stopped.
+    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured; with
+    --area, only what lies within polygons is drawn. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN
+    --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`.
+    When it is interrupted, the same command goes on where it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
