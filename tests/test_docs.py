@@ -64,7 +64,9 @@ def test_paths(page):
 @pytest.fixture
 def somewhere(tmp_path, monkeypatch):
     """A working folder with the files that commands in the pages name, on a machine that has every package."""
-    monkeypatch.setattr("surfkit.runs.make_mesh.require_kernels", lambda what: None)
+    monkeypatch.setattr("surfkit.runs.mesh_output.require_kernels", lambda what: None)
+    for name in ("surfkit.runs.mesh_output", "surfkit.evaluate.geometry.comparison"):
+        monkeypatch.setattr(f"{name}.require_area", lambda: None)
     monkeypatch.chdir(tmp_path)
     for name in ("my-recipe.json", "RUN/recipe.json"):
         write_json(tmp_path / name, recipes()["2dgs"])

@@ -31,8 +31,9 @@ from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import note_metrics
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_levels import load_levels
-from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.make_mesh import make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.run_method import refuse_mesher, refuse_not_drawn, splats_of
@@ -137,7 +138,8 @@ class TrainedRun:
         Args:
             mesher: "tsdf", "visibility" or another by its name, or itself; by default that of the recipe.
             memory: To be used, such as "4GB".
-            settings: Of the mesher (`voxel=0.2`), and of what is written (`triangles=100_000`, `watertight=True`).
+            settings: Of the mesher (`voxel=0.2`), and of what is written (`triangles=100_000`, `watertight=True`,
+                `area="site.gpkg"`).
 
         Raises:
             BadInput: A setting that neither has, or there is no surface, or a mesher where the method has made
@@ -176,7 +178,8 @@ class TrainedRun:
 
         Args:
             gt: Point cloud, mesh or raster of heights that is the truth.
-            settings: With `gt`: of the comparison, `tau=0.5`, `crop="none"`; see `Comparison`.
+            settings: With `gt`: of the comparison, `tau=0.5`, `crop="none"`, `area="site.gpkg"`; see
+                `Comparison`.
 
         Raises:
             BadInput: Nothing to measure, or files that do not belong together.

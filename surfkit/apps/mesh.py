@@ -22,7 +22,8 @@ from surfkit.raster.select import Device
 from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import Run
 from surfkit.runs.journal import record_events
-from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.make_mesh import make_mesh, mesh_input
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.pipeline import loaded
 from surfkit.runs.run_method import refuse_mesher
 from surfkit.runs.run_notes import collect_notes

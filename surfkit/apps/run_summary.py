@@ -191,6 +191,7 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
             f"{cleaning['boundary_share']:.1%} of all edges, in {cleaning['boundaries']:,} loops",
         ),
         *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
+        *([("within", record["area"]["file"])] if "area" in record else []),
         *_finishing_rows(record),
         *(
             (in_words(name.replace("_", " ")), in_words(value))
@@ -307,6 +308,7 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     where = "all" if crop is None else f"area {crop['area']:.4g}, heights {crop['low']:.4g} to {crop['high']:.4g}"
     rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
     rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
+    rows += [("within", found["area"]["file"])] if found.get("area") else []
     if outside := found.get("outside"):  # not in metrics of older versions
         shares = ", ".join(f"{share:.1%} {name}" for name, share in outside.items())
         rows.append(("outside of it", f"{shares}: not measured"))

@@ -77,7 +77,7 @@ def clean(
     if inside is not None:
         mesh, cropped = _keep(mesh, inside(mesh.vertices[mesh.faces].mean(1, dtype=np.float64)))
     if not len(mesh.faces):
-        what = "all lie outside the crop: is it in the frame of the input?" if cropped else "none is whole"
+        what = "all lie outside the crop or area: is it in the frame of the input?" if cropped else "none is whole"
         raise BadInput(f"no triangle of the mesh is left: {what}")
     mesh = _referenced(mesh)  # those of what was dropped are neither finite nor near
     labels, sizes = clusters(mesh, gap)

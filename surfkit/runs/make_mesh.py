@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,17 @@ from surfkit.mesh.clean import CleaningReport, clean
 from surfkit.mesh.closed import closed, require_closed
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.manifold import apart
-from surfkit.mesh.mesh_export import Format, write_mesh
+from surfkit.mesh.mesh_export import write_mesh
 from surfkit.mesh.shade import from_above, shaded, up_of
-from surfkit.mesh.simplify import require_kernels, simplified
+from surfkit.mesh.simplify import simplified
 from surfkit.mesh.stereo import points
 from surfkit.mesh.value_colors import by_value, ends_of, words_of
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import DEFAULT_NEAR
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.runs.folder import Run
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.methods.base import Reconstruction
-from surfkit.scene.crop import Crop, box, read_crop
 from surfkit.scene.lengths import unit_of
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Frame, Scene, View
@@ -46,78 +46,6 @@ PICTURE_SIDE_PX = 800
 """Side of a picture, pixels."""
 SUFFIXES = (".ply", ".obj", ".mtl", ".glb", ".json")
 """Of files that belong to a mesh."""
-
-
-@dataclass(frozen=True)
-class MeshOutput:
-    """What becomes of the triangles of a mesher."""
-
-    formats: tuple[Format, ...] = ("ply",)
-    """Files to write: ply, obj, glb. GLB has 32-bit floats only, so its coordinates are relative to an offset, which is
-    in NAME.glb.json."""
-
-    lods: tuple[float, ...] = ()
-    """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
-
-    triangles: int | None = None
-    """Simplify the mesh to at most this many triangles; flat places get large ones. Parts and holes stay: where they
-    need more, a line says so. With `--error`, it ends at whichever comes first."""
-
-    error: float | None = None
-    """Simplify the mesh until its surface would move by more than about this: metres, or units of the data set where it
-    does not say how long these are. One place of a hundred may move farther."""
-
-    watertight: bool = False
-    """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets
-    walls and a flat base. Small loose sheets are left out."""
-
-    clusters: int = 50
-    """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""
-
-    least_triangles: int = 50
-    """Also drop clusters of connected triangles with fewer triangles than this."""
-
-    cluster_gap: float = 3.0
-    """Clusters with a gap of about this many median edge lengths count as one: thin walls come in pieces. 0: only
-    triangles that share vertices."""
-
-    hole_edges: int = 0
-    """Fill holes of up to this many edges; 0 leaves all open."""
-
-    crop_box: tuple[float, float, float, float, float, float] | None = None
-    """Keep only what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
-
-    crop: Path | None = None
-    """Keep only what lies in the volume of this crop file, JSON in the format of Tanks and Temples, in the frame of the
-    input."""
-
-    def __post_init__(self) -> None:
-        for name in ("clusters", "least_triangles"):
-            if getattr(self, name) < 1:
-                raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
-        if not 0 <= self.cluster_gap <= 100:
-            raise BadInput(f"--cluster-gap {self.cluster_gap:g}: give 0 to 100")
-        if not 0 <= self.hole_edges <= 1000:
-            raise BadInput(f"--hole-edges {self.hole_edges}: give 0 to 1000")
-        if wrong := [share for share in self.lods if not 0 < share < 1]:
-            raise BadInput(f"--lods {wrong[0]:g}: a share of the triangles lies between 0 and 1")
-        if not self.formats:
-            raise BadInput("--formats: name at least one of ply, obj, glb")
-        if self.crop is not None and self.crop_box is not None:
-            raise BadInput("--crop and --crop-box: give one of the two")
-        if self.triangles is not None and self.triangles < 4:
-            raise BadInput(f"--triangles {self.triangles}: give 4 or more")
-        if self.error is not None and not 0 < self.error < float("inf"):
-            raise BadInput(f"--error {self.error:g}: it must be more than 0")
-        for name in ("lods", "triangles", "error", "watertight"):
-            if getattr(self, name):
-                require_kernels(f"--{name}")
-
-    def volume(self) -> Crop | None:
-        """The crop, in the frame of the input."""
-        if self.crop_box is not None:
-            return box(self.crop_box)
-        return None if self.crop is None else read_crop(self.crop)
 
 
 def mesh_input(
@@ -187,13 +115,15 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         steps: Optimisation steps that what is meshed was made with.
 
     Raises:
-        BadInput: There is no surface, or nothing is left of it.
+        BadInput: There is no surface, or nothing is left of it; or the area lies in another place.
     """
-    began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
+    began, frame = time.perf_counter(), subject.frame
+    volume, area = delivery.volume(), delivery.area_of(subject, mesher)
+    parts = [part.inside for part in (volume, area) if part is not None]
     forget_spooled(run.out)
     raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
     facts = plain_facts(maker_of(run, mesher), raw)
-    inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
+    inside = (lambda local: np.all([part(frame.to_input(local)) for part in parts], axis=0)) if parts else None
     least = delivery.clusters, delivery.least_triangles
     mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
     del raw
@@ -209,6 +139,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "steps": steps,
         "facts": facts,
         "cleaning": describe(report, subject),
+        **({} if area is None else {"area": area.record()}),
         **done,
         "triangles": len(mesh.faces),
         "vertices": len(mesh.vertices),

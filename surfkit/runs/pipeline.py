@@ -38,8 +38,9 @@ from surfkit.runs.folder import (
 )
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_levels import has_levels, make_wanted_levels
-from surfkit.runs.make_mesh import MeshOutput, has_mesh, make_mesh, mesh_input
+from surfkit.runs.make_mesh import has_mesh, make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate, measure_compressed
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.photo_light import LightRecord, light_in_short, needed_light, warn_of_light, write_light
 from surfkit.runs.recipe import Recipe, complete, refuse_unused

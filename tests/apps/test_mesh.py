@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from needs import needs
 from PIL import Image
+from polygon_files import write_polygons
 
 from surfkit.cli import main
 from surfkit.evaluate.geometry.surface_file import read_surface
@@ -121,6 +122,30 @@ def test_a_closed_mesh(finished, capsys):
     assert closing["skirts"] >= 1 and closing["base"] == pytest.approx(low, abs=0.5)
     assert closing["volume"] == pytest.approx(trimesh.load(out / "mesh.ply").volume, rel=0.05)
     assert "parts on a base, " in capsys.readouterr().out
+
+
+def test_only_what_lies_in_an_area(finished, tmp_path, capsys):
+    """The data set has no coordinate reference system; z is up, as the cameras tell."""
+    out, _ = finished
+    shapely = needs("shapely")
+    shape = shapely.Polygon([(-6, -5), (7, -3), (1, 8)], [[(-1, -1), (1, -1), (0, 1)]])
+    site = write_polygons(tmp_path / "site.shp", shape, crs=None)
+    words = ["mesh:tsdf", "--least-triangles", "1", "--cluster-gap", "0", "--area", str(site)]
+    assert main(["mesh", str(out), *words]) == 0
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    middles = mesh.triangles_center[:, :2]
+    assert len(middles) > 100 and shapely.contains_xy(shape.buffer(1e-4), *middles.T).all()
+    facts = record(out)
+    assert facts["area"] == {"file": str(site), "polygons": 1, "area": pytest.approx(shape.area)}
+    assert facts["cleaning"]["cropped"] > 0 and str(site) in capsys.readouterr().out
+    high = -1.0 < mesh.triangles_center[:, 2]
+    assert main(["mesh", str(out), *words, "--crop-box", "-50", "-50", "-1", "50", "50", "50"]) == 0
+    assert 0 < len(trimesh.load(out / "mesh.ply", process=False).faces) <= high.sum()
+    before = (out / "mesh.ply").read_bytes()
+    far = write_polygons(tmp_path / "far.shp", shapely.box(1e6, 1e6, 2e6, 2e6), crs=None)
+    assert main(["mesh", str(out), "mesh:tsdf", "--area", str(far)]) == 2
+    said = capsys.readouterr().err
+    assert f"--area {far}: polygon 1 ('a'): it lies within" in said and (out / "mesh.ply").read_bytes() == before
 
 
 def test_what_is_known_of_each_vertex_is_written_and_drawn(finished, monkeypatch, capsys):

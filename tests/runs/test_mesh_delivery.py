@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from needs import needs
+from polygon_files import write_polygons
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
@@ -13,10 +15,12 @@ from surfkit.io import glb
 from surfkit.io.datasets.data import Data
 from surfkit.mesh import mesh_export as files
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.clean import clean
 from surfkit.mesh.simplify import simplified
 from surfkit.runs import make_mesh as delivering
 from surfkit.runs.folder import Run
-from surfkit.runs.make_mesh import MeshOutput, finished, forget_geometry, levels, write_files
+from surfkit.runs.make_mesh import finished, forget_geometry, levels, write_files
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.scene import Frame
 
@@ -81,6 +85,39 @@ def test_the_error_is_in_metres_or_else_in_units_of_the_data_set(metres, local):
     assert np.array_equal(found.faces, simplified(mesh, error=local).faces) and len(found.faces) < len(faces) / 2
     assert done == {"simplification": {"triangles_before": len(faces), "triangles": len(found.faces)}}
     assert finished(mesh, MeshOutput(), subject) == (mesh, {})
+
+
+def slab(low, high, count):
+    """A level floor and a level roof of so many squares along each side, in a frame as large as they are."""
+    x, y = np.meshgrid(*2 * [np.linspace(0, 1, count + 1)], indexing="ij")
+    at = np.arange((count + 1) ** 2).reshape(count + 1, count + 1)
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    floor, roof = (np.stack([x, y, np.full_like(x, height)], 2).reshape(-1, 3) for height in (low, high))
+    whole = np.concatenate([faces[:, ::-1], faces + len(floor)]).astype(np.int32)
+    return Mesh(np.concatenate([floor, roof]).astype(np.float32), whole)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:4326", "EPSG:25832"])
+def test_a_slab_cut_by_a_triangle_with_a_hole(tmp_path, crs):
+    """Its roof has the area of the polygon and its volume is that times its height, within a row of triangles."""
+    shapely = needs("shapely")
+    east, north, side, count = 451_234.0, 5_873_211.0, 100.0, 200
+    corners, hole = [(10, 8), (90, 30), (25, 85)], [(30, 30), (50, 35), (35, 50)]
+    ring, inner = ([(east + x, north + y) for x, y in each] for each in (corners, hole))
+    shape = shapely.Polygon(ring, [inner])
+    path = write_polygons(tmp_path / "site.gpkg", shape, crs=crs)
+    frame = Frame(np.array([east, north, 50.0]), 1 / side, 1.0, "EPSG:32633")
+    mesh, subject = slab(0.02, 0.07, count), SimpleNamespace(frame=frame, views=())
+    area = MeshOutput(area=path).area_of(subject, mesh)
+    assert area.shape.area == pytest.approx(shape.area, rel=1e-5)
+    found, report = clean(mesh, 50, 1, lambda local: area.inside(frame.to_input(local)))
+    corners = found.vertices[found.faces].astype(np.float64) * side
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    up = normals[:, 2] > 0
+    assert normals[up, 2].sum() == pytest.approx(shape.area, rel=5e-3)
+    assert (corners.mean(1)[:, 2] * normals[:, 2]).sum() == pytest.approx(5 * shape.area, rel=5e-3)
+    assert report.cropped == len(mesh.faces) - len(found.faces)
 
 
 def test_a_level_that_would_not_be_closed_is_refused():

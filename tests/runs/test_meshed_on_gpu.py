@@ -18,7 +18,8 @@ from surfkit.raster.select import select
 from surfkit.runs import pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.compress_model import compress_run
-from surfkit.runs.make_mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.runs.make_mesh import make_mesh, mesh_input
+from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.pipeline import loaded, run
 from surfkit.runs.recipe import with_steps
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu

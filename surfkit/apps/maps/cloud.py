@@ -39,7 +39,7 @@ def write_cloud(
 
     Args:
         surface: The mesh.
-        sheet: Where; points outside of its cells are left out.
+        sheet: Where; points outside of its cells and its area are left out.
         name: File name.
         spacing: Side of a square, units of the input.
         classify: Tells the classes of points; None leaves them at 0, never classified.
@@ -69,6 +69,8 @@ def write_cloud(
         for places, colors in sample_evenly(surface, spacing**2):
             places = sheet.grid.to_map(places)
             inside = ((places[:, :2] >= [west, south]) & (places[:, :2] <= [east, north])).all(1)
+            if sheet.grid.area is not None:
+                inside = inside & sheet.grid.area.contains(places[:, :2])
             record = laspy.ScaleAwarePointRecord.zeros(int(inside.sum()), header=header)
             record.x, record.y, record.z = places[inside].T
             record.return_number[:] = record.number_of_returns[:] = 1

@@ -39,10 +39,10 @@ class MapsCommand:
     expected errors of heights, and terrain without buildings and trees.
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
-    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured. Needs
-    `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`,
-    `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same command goes on where
-    it stopped.
+    --against, the heights of another mesh are subtracted; with --volume, volumes within polygons are measured; with
+    --area, only what lies within polygons is drawn. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps RUN
+    --gsd 0.1`, `surfkit maps RUN --volume HEAPS.geojson`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`.
+    When it is interrupted, the same command goes on where it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -142,6 +142,7 @@ def show(out: Path, record: dict[str, Any]) -> None:
         ("up", record["up"]),
         ("ground sampling distance", f"{record['gsd']:g} {unit}"),
         ("size", "{} x {} cells".format(*record["size"])),
+        *([("area", f"{found['area']:,.6g} {unit}², from {found['file']}")] if (found := record.get("area")) else []),
         ("covered", f"{record['covered']:.1%}"),
         ("heights", "{:.2f} to {:.2f} {}".format(*record["heights"], unit)),
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,8 +23,6 @@ MAX_CONTOUR_LEVELS = 10_000
 """Of a map."""
 LINES_TOGETHER = 10_000
 """Lines that are written at once."""
-WKB_LINESTRING = 2
-"""LineString in well-known binary."""
 
 
 def even_interval(lowest: float, highest: float) -> float:
@@ -50,8 +47,9 @@ def write_contours(
         least: Shorter lines are left out, units of the input.
         side: Of a tile, cells.
     """
-    with needed("pyogrio", "contour lines"):
-        import pyogrio  # noqa: F401 (before anything is traced)
+    for package in ("pyogrio", "shapely"):  # before anything is traced
+        with needed(package, "contour lines"):
+            __import__(package)
     import rasterio
 
     grid, path, count, short = sheet.grid, sheet.folder / name, 0, 0
@@ -88,9 +86,10 @@ def write_contours(
 
 def _append(lines: list[Line], path: Path, layer: dict[str, Any]) -> int:
     """Write lines to those of a file, and return how many they are."""
+    import shapely
     from pyogrio.raw import write
 
-    shapes = np.array([_binary(line) for _, line in lines], object)
+    shapes = np.array([shapely.LineString(line).wkb for _, line in lines], object)
     levels = np.array([level for level, _ in lines], np.float64)
     write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
     return len(lines)
@@ -146,8 +145,3 @@ def contour_lines(heights: np.ndarray, grid: MapGrid, window: Window, interval: 
                 place = np.stack([grid.west + line[:, 0], grid.north - line[:, 1]], axis=1) * grid.gsd
                 found.append((height, place))
     return found
-
-
-def _binary(line: np.ndarray) -> bytes:
-    """Well-known binary of a line of (n, 2) float64."""
-    return struct.pack("<BII", 1, WKB_LINESTRING, len(line)) + line.astype("<f8").tobytes()

@@ -18,7 +18,6 @@ from surfkit.apps.maps.hillshade import draw_hillshade
 from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
 from surfkit.apps.maps.orthophoto import OrthophotoColors
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
-from surfkit.apps.maps.polygon_file import AreaPolygon, read_polygons
 from surfkit.apps.maps.precision import Rays, StereoDepths, write_precision
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
@@ -34,6 +33,8 @@ from surfkit.core.optional import needed
 from surfkit.core.stages import key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
+from surfkit.io.area import bounds_of, read_area, require_area
+from surfkit.io.polygon_file import AreaPolygon, Site, read_polygons, require_polygons
 from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.crop import Axis
@@ -53,7 +54,8 @@ SHORTEST_CELLS = 30
 """Length of the shortest contour line that is written without being asked for others, cells."""
 VOLUME_FILES = ("volumes", "volumes-table")
 """Files of volumes."""
-PRODUCT_PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
+PRODUCT_PACKAGES = {"contours": ("pyogrio", "shapely"), "points": ("laspy", "lazrs")}
+VOLUME_OPTION = "--volume"
 """What products need beside rasterio."""
 
 
@@ -72,6 +74,10 @@ class MapSettings:
 
     bounds: tuple[float, float, float, float] | None = None
     """Draw only this part: west south east north, in coordinates of the map. Default: the whole mesh."""
+
+    area: Path | None = None
+    """Draw only what lies within the polygons of this file, GeoJSON, GPKG or SHP, by the centres of cells. The maps
+    reach as far as the polygons."""
 
     interval: Length = "auto"
     """Between contour lines, like --gsd. `auto` is 1, 2 or 5 times a power of ten that gives at most 20 levels."""
@@ -149,8 +155,9 @@ class MapSettings:
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
         if self.volume is not None:
-            with needed("pyogrio", "--volume"):
-                __import__("pyogrio")
+            require_polygons(VOLUME_OPTION)
+        if self.area is not None:
+            require_area()
         if self.colors == "photographs":
             require_simplification("simplifying a mesh")
 
@@ -195,7 +202,9 @@ def make_maps(
         refuse_apart(surface, grid)
     if other is not None:
         refuse_apart(other, grid)
-    polygons = [] if settings.volume is None else read_polygons(settings.volume, grid, frame.crs)
+    polygons = []
+    if settings.volume is not None:
+        polygons = read_polygons(settings.volume, VOLUME_OPTION, Site("the map", frame.crs, grid.bounds))
     done, unit = drawable(surface, settings), unit_of(frame)
     files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()),
              *(VOLUME_FILES if polygons else ()))]  # fmt: skip
@@ -204,7 +213,7 @@ def make_maps(
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
         seen(subject.views) if settings.colors == "photographs" else "",
         depths.key if depths is not None and "precision" in settings.products else "",
-        [each.as_lists() for each in polygons],
+        [(each.name, each.shape.wkb.hex()) for each in polygons], grid.area and grid.area.shape.wkb.hex(),
     )  # fmt: skip
     with workshop(out, (*files, MAPS_RECORD), key) as folder:
         replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
@@ -224,9 +233,11 @@ def make_maps(
             "gsd": grid.gsd,
             "bounds": list(grid.bounds),
             "size": [grid.width, grid.height],
-            "covered": round(drawn.covered / (grid.width * grid.height), 6),
+            "covered": round(min(1.0, drawn.covered / grid.cells), 6),
             "heights": [drawn.lowest, drawn.highest],
         }
+        if grid.area is not None:
+            record["area"] = grid.area.record()
         if "orthophoto" in done and settings.colors == "photographs":
             record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
         record |= draw_products(subject, settings, sheet, drawn, done)
@@ -260,12 +271,18 @@ def grid_of(subject: MeshWithPhotos, settings: MapSettings, turn: np.ndarray) ->
         gsd = ground_sampling_distance(surface, subject.views, frame)
     else:
         gsd = settings.gsd / (frame.metres or 1.0)
-    return MapGrid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+    bounds = settings.bounds or bounds_of(surface.blocks(), turn)
+    if settings.area is None:
+        return MapGrid.around(turn, gsd, bounds)
+    area = read_area(settings.area, Site("the map", frame.crs, bounds), turn)
+    west, south, east, north = area.bounds
+    bounds = max(west, bounds[0]), max(south, bounds[1]), min(east, bounds[2]), min(north, bounds[3])
+    return replace(MapGrid.around(turn, gsd, bounds), area=area)
 
 
 def refuse_apart(surface: SurfaceFile, grid: MapGrid) -> None:
     """BadInput for a mesh that lies beside the cells, before maps that are there are replaced."""
-    west, south, east, north = found = bounds_of(surface, grid.turn)
+    west, south, east, north = found = bounds_of(surface.blocks(), grid.turn)
     borders = grid.bounds
     if west > borders[2] or east < borders[0] or south > borders[3] or north < borders[1]:
         raise BadInput(
@@ -378,12 +395,3 @@ def subtract(
     claim(sheet.out, PRODUCT_FILES["picture"])
     draw_difference(sheet.out / PRODUCT_FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}
-
-
-def bounds_of(surface: SurfaceFile, turn: np.ndarray) -> tuple[float, float, float, float]:
-    """West, south, east and north of the vertices of a mesh."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for block in surface.blocks():
-        placed = (block @ turn.T)[:, :2] if len(block) else np.empty((0, 2))
-        low, high = np.minimum(low, placed.min(0, initial=np.inf)), np.maximum(high, placed.max(0, initial=-np.inf))
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

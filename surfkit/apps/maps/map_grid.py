@@ -12,6 +12,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
+from surfkit.io.area import Area
 from surfkit.scene.crs import TOPOCENTRIC, refuse_other_unit, scale_at
 from surfkit.scene.scene import Frame
 
@@ -44,6 +45,7 @@ class MapGrid:
         north: Northing of the upper border, in cells.
         width: Cells.
         height: Cells.
+        area: What of the map is drawn; None for all of it.
     """
 
     turn: np.ndarray
@@ -52,6 +54,7 @@ class MapGrid:
     north: int
     width: int
     height: int
+    area: Area | None = None
 
     @classmethod
     def around(cls, turn: np.ndarray, gsd: float, bounds: tuple[float, float, float, float]) -> MapGrid:
@@ -79,6 +82,24 @@ class MapGrid:
         edges = self.west, self.north - self.height, self.west + self.width, self.north
         west, south, east, north = (edge * self.gsd for edge in edges)
         return west, south, east, north
+
+    @property
+    def cells(self) -> float:
+        """How many are drawn; of an area, as many as its part on the map would hold."""
+        if self.area is None:
+            return self.width * self.height
+        return self.area.within(self.bounds) / self.gsd**2
+
+    def drawn(self, window: Window) -> np.ndarray:
+        """(H, W) bool: which cells of a window are drawn, as their centres lie in the area."""
+        inside = np.ones((window.height, window.width), bool)
+        if self.area is not None:
+            east = (self.west + window.left + np.arange(window.width) + 0.5) * self.gsd
+            north = (self.north - window.top - np.arange(window.height) - 0.5) * self.gsd
+            inside = self.area.contains(np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)).reshape(
+                inside.shape
+            )
+        return inside
 
     def to_map(self, xyz: np.ndarray) -> np.ndarray:
         """(..., 3) float64 easting, northing and height of positions in the frame of the input."""

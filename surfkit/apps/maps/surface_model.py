@@ -88,7 +88,7 @@ def draw_surface(
         if not found:
             raise BadInput(
                 f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
-                "smaller --gsd, or other --bounds"
+                "smaller --gsd, or other --bounds or another --area"
             )
     return SurfaceModelStats(
         sum(facts["covered"] for facts in found),
@@ -99,10 +99,12 @@ def draw_surface(
 
 
 def drawn_tile(bins: Bins, tile: int, window: Window) -> ZBuffer:
-    """The highest triangles on a tile of the map."""
+    """The highest triangles on a tile of the map, in the cells that are drawn."""
     buffer = ZBuffer(window)
     for numbers in bins.of(tile):
         buffer.draw(corners_of(bins.surface, bins.grid, numbers), numbers)
+    if bins.grid.area is not None and buffer.covered.any():
+        buffer.leave(bins.grid.drawn(window))
     return buffer
 
 

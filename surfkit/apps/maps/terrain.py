@@ -281,8 +281,9 @@ def write_terrain(
             facts = rasters[0].facts(window)
             if facts is None:
                 layers, facts = terrain_tile(heights, ground, window)
+                drawn = sheet.grid.drawn(window)
                 for raster, layer in reversed(list(zip(rasters, layers, strict=True))):  # the first last: it is done
-                    raster.write(np.where(np.isfinite(layer), layer, NODATA), window, facts)
+                    raster.write(np.where(drawn & np.isfinite(layer), layer, NODATA), window, facts)
             found.append(facts)
             emit(Progress("drawing the terrain", at + 1, len(windows)))
     total = {name: sum(facts[name] for facts in found) for name in found[0]}

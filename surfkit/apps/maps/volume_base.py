@@ -10,9 +10,9 @@ import numpy as np
 
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.map_grid import MapGrid, Window
-from surfkit.apps.maps.polygon_file import AreaPolygon
 from surfkit.apps.maps.rasters import TILE_SIDE_CELLS
 from surfkit.core.check import BadInput
+from surfkit.io.polygon_file import AreaPolygon
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -71,7 +71,7 @@ def outline_heights(model: DatasetReader, grid: MapGrid, polygon: AreaPolygon) -
         grid: Its cells.
         polygon: The polygon.
     """
-    outlines = [part[0] for part in polygon.parts]
+    outlines = polygon.outlines
     whole = sum(float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum()) for ring in outlines)
     step = max(grid.gsd, whole / MAX_OUTLINE_SAMPLES)
     places, lengths = (np.concatenate(each) for each in zip(*(_along(ring, step) for ring in outlines), strict=True))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -16,11 +15,11 @@ from surfkit.apps.maps.cell_shares import OutlinePieces, outline_pieces
 from surfkit.apps.maps.geotiff import GDAL_CACHE_MB, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.map_grid import MapGrid, Window
-from surfkit.apps.maps.polygon_file import AreaPolygon
 from surfkit.apps.maps.volume_base import BaseKind, base_of, outline_heights
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.optional import needed
+from surfkit.io.polygon_file import AreaPolygon
 
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
@@ -29,7 +28,6 @@ BLOCK_ROWS, BLOCK_COLUMNS = 512, 2048
 """Cells that are in memory at once. They do not depend on --tile, so volumes do not either, to the last bit."""
 TOLD_MISSING = 0.01
 """Share of a polygon without surface from which on a message tells of it."""
-WKB_POLYGON, WKB_MULTIPOLYGON = 3, 6
 
 
 @dataclass(frozen=True)
@@ -161,11 +159,11 @@ def _measured(
     covered, fill, cut, compared, changed, fill_since, cut_since = map(float, total * grid.gsd**2)
     if not covered:
         raise BadInput(f"{where}: the map has no surface in it; move it, or delete it from the file")
-    missing = max(0.0, 1 - covered / polygon.area)
+    missing = max(0.0, 1 - covered / polygon.shape.area)
     if missing >= TOLD_MISSING:
         emit(Warned(f"{where}: {missing:.1%} of it has no surface, and counts neither as fill nor as cut"))
     return Volume(
-        polygon.name, polygon.area, round(missing, 9), kind if isinstance(kind, str) else "height", base.lowest,
+        polygon.name, polygon.shape.area, round(missing, 9), kind if isinstance(kind, str) else "height", base.lowest,
         base.highest, round(outline.share, 9), fill, cut, fill - cut, (fill - cut) / covered, highest, base.residual,
         None if base.residual is None else base.residual * covered,
         *((None,) * 5 if other is None else (compared, changed, fill_since, cut_since, fill_since - cut_since)),
@@ -218,7 +216,7 @@ def write_volumes(
         values: list[Any] = [row[name] for row in rows]
         texts = isinstance(values[0], str)
         columns.append(np.array(values, object) if texts else np.array(values, np.float64))  # None is NaN, a NULL there
-    shapes = np.array([_binary(polygon) for polygon in polygons], object)
+    shapes = np.array([polygon.shape.wkb for polygon in polygons], object)
     kind = {"layer": "volumes", "driver": "GPKG", "geometry_type": "MultiPolygon", "crs": sheet.crs.to_wkt()}
     write(path, shapes, columns, names, **kind)
     sheet.deliver(sheet.folder / table)
@@ -229,12 +227,3 @@ def volumes_record(volumes: Sequence[Volume]) -> dict[str, Any]:
     """What maps.json says of volumes: each of them, and the sums of fill, cut and net."""
     sums = {name: sum(getattr(volume, name) for volume in volumes) for name in ("fill", "cut", "net")}
     return {**sums, "polygons": [asdict(volume) for volume in volumes]}
-
-
-def _binary(polygon: AreaPolygon) -> bytes:
-    """Well-known binary of a polygon, as one of many parts."""
-    found = struct.pack("<BII", 1, WKB_MULTIPOLYGON, len(polygon.parts))
-    for part in polygon.parts:
-        found += struct.pack("<BII", 1, WKB_POLYGON, len(part))
-        found += b"".join(struct.pack("<I", len(ring)) + ring.astype("<f8").tobytes() for ring in part)
-    return found

@@ -34,6 +34,10 @@ class ZBuffer:
         """(H, W) bool: where there is a triangle."""
         return self.face != NO_TRIANGLE
 
+    def leave(self, kept: np.ndarray) -> None:
+        """Forget the triangles of all cells but those of an (H, W) bool mask."""
+        self.height[~kept], self.face[~kept] = -np.inf, NO_TRIANGLE
+
     def draw(self, corners: np.ndarray, numbers: np.ndarray) -> None:
         """Draw triangles.
 

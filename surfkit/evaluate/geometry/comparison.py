@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.evaluate.geometry.compared_area import compared_area, seen_from
 from surfkit.evaluate.geometry.presets import PRESETS, PresetName
 from surfkit.evaluate.geometry.registration import ICP_ROUNDS
 from surfkit.evaluate.geometry.repetition import (
@@ -27,8 +27,9 @@ from surfkit.evaluate.geometry.repetition import (
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
-from surfkit.evaluate.geometry.transform import apply, read_transform, scale_of
+from surfkit.evaluate.geometry.transform import read_transform, scale_of
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
+from surfkit.io.area import Area, require_area
 from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
@@ -68,6 +69,10 @@ class Comparison:
     crop: str = "auto"
     """Volume in which the two are compared: a JSON file in the format of Tanks and Temples, `auto` for the volume of
     the ground truth that enough training views see (--visible), or `none`."""
+
+    area: Path | None = None
+    """Compare only what lies within the polygons of this file in plan: GeoJSON, GPKG or SHP, in any coordinate
+    reference system. With --crop, what lies in both counts."""
 
     tau: float | None = None
     """Distance threshold: a nearer point counts as correct. In units of the ground truth. Default: 1.5 times the mean
@@ -125,6 +130,8 @@ class Comparison:
             raise BadInput(
                 f"--visible {self.visible:g}: give a share of the views, more than 0 and at most 1, or a number of them"
             )
+        if self.area is not None:
+            require_area()
         if self.preset is not None and self.preset not in PRESETS:
             raise BadInput(f"--preset {self.preset}: choose one of {', '.join(PRESETS)}")
 
@@ -166,6 +173,7 @@ class ComparisonResult:
         voxel: By which the truth was thinned first, or None.
         sides: The reconstruction and the truth, which the points were drawn from.
         outside: Shares of the reconstruction above, below and beside the volume; None without one.
+        area: What counts of the volume, frame of the truth; None for all of it.
     """
 
     draws: tuple[RepetitionResult, ...]
@@ -177,6 +185,7 @@ class ComparisonResult:
     voxel: float | None
     sides: tuple[ComparedSurface, ComparedSurface]
     outside: dict[str, float] | None = None
+    area: Area | None = None
 
 
 def compare(
@@ -204,10 +213,16 @@ def compare(
     theirs, tau = truth_side(truth, settings)
     first = theirs.points(np.random.default_rng(settings.seed))
     refuse_few(first, truth.path)
+    area, area_box = None, None
+    if settings.area is not None:
+        sides = reconstruction, truth
+        area, area_box = compared_area(settings.area, sides, settings.up, views, frame, matrix)
+        first = first[area.inside(first)]
+        refuse_few(first, truth.path, f" within --area {settings.area}")
     crop, seen = volume(first, settings, views, frame, (matrix, tau))
     if crop is not None and settings.crop == "auto":
-        crop = heightened(crop, reconstruction, matrix, tau)
-    box = None if crop is None else around(crop, tau)
+        crop = heightened(crop, reconstruction, matrix, tau, area)
+    box = around(crop, area_box, tau)
     own_box, own_tau = box and seen_from(np.linalg.inv(matrix), box), tau / scale_of(matrix)
     ours = make_side(reconstruction, None, settings.samples, own_tau, own_box)
     if theirs.sparse is not None:
@@ -219,7 +234,7 @@ def compare(
     done, total = 0, len(ALIGNMENTS) + settings.draws - 1
     emit(Progress("measuring", done, total))
     for number in range(settings.draws):
-        measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
+        measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]), area)
         if number == 0:
             measure.refuse_other_frame(matrix)
         found: dict[str, RepetitionResult | None] = {}
@@ -232,8 +247,8 @@ def compare(
     warn_of_loss(draws[0], others["none"], settings.align, tau)
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
-    outside = None if crop is None else outside_shares(reconstruction, draws[0].alignment.matrix, crop)
-    return ComparisonResult(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside)
+    outside = None if crop is None else outside_shares(reconstruction, draws[0].alignment.matrix, crop, area)
+    return ComparisonResult(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside, area)
 
 
 def refuse_sizes(settings: Comparison, truth: SurfaceFile) -> None:
@@ -282,20 +297,18 @@ def make_side(
     return cloud_side(surface, voxel) if surface.faces is None else mesh_side(surface, samples, tau, box)
 
 
-def around(crop: Crop, tau: float) -> Box:
-    """The box about a crop volume, with room for what alignment brings into it."""
+def around(crop: Crop | None, area: Box | None, tau: float) -> Box | None:
+    """The box about a crop volume, and that of an area, with room for what alignment brings into it; None without."""
+    room = ICP_ROUNDS[0][1] * tau
+    if crop is None:
+        return None if area is None else (area[0] - room, area[1] + room)
     plane, along = list(PLANES[crop.axis]), "xyz".index(crop.axis)
     low, high = np.empty(3), np.empty(3)
     low[plane], high[plane] = crop.polygon.min(0), crop.polygon.max(0)
     low[along], high[along] = crop.low, crop.high
-    room = ICP_ROUNDS[0][1] * tau
+    if area is not None:
+        low, high = np.maximum(low, area[0]), np.minimum(high, area[1])
     return low - room, high + room
-
-
-def seen_from(matrix: np.ndarray, box: Box) -> Box:
-    """The box about the corners of a box in another frame."""
-    corners = apply(matrix, np.array(list(product(*zip(*box, strict=True)))))
-    return corners.min(0), corners.max(0)
 
 
 def volume(

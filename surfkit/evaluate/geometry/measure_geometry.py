@@ -117,6 +117,7 @@ def figures(outcome: ComparisonResult, settings: Comparison) -> dict[str, Any]:
         "chamfer_dtu": {**chamfer(first.distances, far), "far": far},
         "points": {"reconstruction": len(first.reconstruction), "truth": len(first.truth)},
         "crop": crop and {"from": settings.crop, "low": crop.low, "high": crop.high, "area": crop.area},
+        "area": outcome.area and outcome.area.record(),
         "outside": outcome.outside,
         "truth_voxel": outcome.voxel,
         "seen_points": outcome.seen,

@@ -19,6 +19,7 @@ from surfkit.evaluate.geometry.surface_file import SurfaceFile, part_within
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
+from surfkit.io.area import Area
 from surfkit.scene.available_memory import free_bytes
 from surfkit.scene.crop import Crop
 
@@ -156,12 +157,19 @@ class Measurement:
         crop: Volume, or None.
         tau: Threshold; points are thinned to half of it.
         draw: Of the points and of where the lattice of voxels begins.
+        area: What counts of the volume, frame of the truth; None for all of it.
     """
 
     def __init__(
-        self, ours: ComparedSurface, theirs: ComparedSurface, crop: Crop | None, tau: float, draw: np.random.Generator
+        self,
+        ours: ComparedSurface,
+        theirs: ComparedSurface,
+        crop: Crop | None,
+        tau: float,
+        draw: np.random.Generator,
+        area: Area | None = None,
     ) -> None:
-        self.crop, self.tau, self.paths = crop, tau, (ours.surface.path, theirs.surface.path)
+        self.crop, self.area, self.tau, self.paths = crop, area, tau, (ours.surface.path, theirs.surface.path)
         target, self.offset = theirs.points(draw), draw.random(3)  # first: the same for every reconstruction
         self.source = ours.points(draw)
         self.target = self.cropped(target)
@@ -170,8 +178,10 @@ class Measurement:
         self.found: dict[tuple[bytes, bool], IcpResult] = {}
 
     def cropped(self, points: np.ndarray) -> np.ndarray:
-        """Those in the crop volume, of (n, 3) points in the frame of the truth."""
-        return points if self.crop is None else points[self.crop.inside(points)]
+        """Those in the crop volume and the area, of (n, 3) points in the frame of the truth."""
+        for part in (self.crop, self.area):
+            points = points if part is None else points[part.inside(points)]
+        return points
 
     def thinned(self, points: np.ndarray, voxel: float) -> np.ndarray:
         """(m, 3) of (n, 3) points in the frame of the truth."""
@@ -232,9 +242,10 @@ class Measurement:
         moved = self.cropped(apply(matrix, self.source))
         places = f"the reconstruction spans {self.spans[0]}, the truth {self.spans[1]}"
         remedy = "if frames or units differ, give --transform; if the crop volume is wrong, --crop"
+        parts = ["the crop volume"] * (self.crop is not None) + ["--area"] * (self.area is not None)
         for points, what, path in zip((moved, self.target), ("reconstruction", "truth"), self.paths, strict=True):
             if len(points) < MIN_COMPARED_POINTS:
-                where = "in all" if self.crop is None else "inside the crop volume"
+                where = f"inside {' and '.join(parts)}" if parts else "in all"
                 raise BadInput(f"{path}: {len(points)} points of the {what} {where}; {places}; {remedy}")
         sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (moved, self.target)]
         if sizes[0] < MIN_EXTENT_RATIO * sizes[1]:
@@ -249,7 +260,7 @@ class Measurement:
             )
 
 
-def refuse_few(points: np.ndarray, path: Path) -> None:
-    """BadInput if shares of so few points would mean nothing."""
+def refuse_few(points: np.ndarray, path: Path, where: str = "") -> None:
+    """BadInput if shares of so few points would mean nothing; `where` says which of the file they are."""
     if len(points) < MIN_COMPARED_POINTS:
-        raise BadInput(f"{path}: {len(points)} points; {MIN_COMPARED_POINTS} or more are needed to compare with")
+        raise BadInput(f"{path}: {len(points)} points{where}; {MIN_COMPARED_POINTS} or more are needed to compare with")

@@ -14,6 +14,7 @@ from surfkit.evaluate.geometry.point_visibility import visible_counts
 from surfkit.evaluate.geometry.scores import surface_gap, tree
 from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, SurfaceFile
 from surfkit.evaluate.geometry.transform import apply, scale_of
+from surfkit.io.area import Area
 from surfkit.scene.crop import PLANES, Axis, Crop, within
 from surfkit.scene.scene import Frame, View
 
@@ -70,7 +71,9 @@ def visible_crop(
     return Crop(outline(ground, radius), low, high, settings.axis), len(kept)
 
 
-def heightened(crop: Crop, reconstruction: SurfaceFile, matrix: np.ndarray, room: float) -> Crop:
+def heightened(
+    crop: Crop, reconstruction: SurfaceFile, matrix: np.ndarray, room: float, area: Area | None = None
+) -> Crop:
     """The volume as high and as deep as a reconstruction reaches above and below the polygon.
 
     Else nobody would see a false surface below the truth, or above it. What lies farther away than the volume is wide,
@@ -81,19 +84,28 @@ def heightened(crop: Crop, reconstruction: SurfaceFile, matrix: np.ndarray, room
         reconstruction: In its own frame.
         matrix: (4, 4) from that frame to that of the truth.
         room: Added below and above.
+        area: What counts of the volume, frame of the truth.
     """
     low, high, axis = crop.low, crop.high, "xyz".index(crop.axis)
     wide = float(np.linalg.norm(np.ptp(crop.polygon, axis=0)))
     for block in reconstruction.blocks():
         moved = apply(matrix, block)
         moved = moved[(moved[:, axis] > crop.low - wide) & (moved[:, axis] < crop.high + wide)]
-        along = moved[within(crop.polygon, moved[:, list(PLANES[crop.axis])]), axis]
+        along = moved[_over(crop, area, moved), axis]
         low, high = min(low, along.min(initial=low)), max(high, along.max(initial=high))
     return replace(crop, low=low - room * (low < crop.low), high=high + room * (high > crop.high))
 
 
-def outside_shares(reconstruction: SurfaceFile, matrix: np.ndarray, crop: Crop) -> dict[str, float]:
-    """Shares of a reconstruction that lie outside of a volume: above it, below it, and beside it.
+def _over(crop: Crop, area: Area | None, points: np.ndarray) -> np.ndarray:
+    """(n,) bool: which of (n, 3) points, frame of the truth, lie on the polygon of a volume, and in the area."""
+    found = within(crop.polygon, points[:, list(PLANES[crop.axis])])
+    return found if area is None else found & area.inside(points)
+
+
+def outside_shares(
+    reconstruction: SurfaceFile, matrix: np.ndarray, crop: Crop, area: Area | None = None
+) -> dict[str, float]:
+    """Shares of a reconstruction that lie outside of a volume: above it, below it, and beside it or the area.
 
     Of the area of a mesh, each triangle by its centre, or of the points of a cloud.
 
@@ -101,12 +113,13 @@ def outside_shares(reconstruction: SurfaceFile, matrix: np.ndarray, crop: Crop) 
         reconstruction: In its own frame.
         matrix: (4, 4) from that frame to that of the truth.
         crop: The volume.
+        area: What counts of it, frame of the truth.
     """
     axis, whole = "xyz".index(crop.axis), 0.0
     found = {"above": 0.0, "below": 0.0, "beside": 0.0}
     for points, weights in _weighted(reconstruction):
         moved = apply(matrix, points)
-        inside = within(crop.polygon, moved[:, list(PLANES[crop.axis])])
+        inside = _over(crop, area, moved)
         parts = (inside & (moved[:, axis] > crop.high), inside & (moved[:, axis] < crop.low), ~inside)
         for name, part in zip(found, parts, strict=True):
             found[name] += float(weights[part].sum())
