@@ -17,6 +17,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     from surfkit.io.splats.splat import Splat
     from surfkit.io.splats.spz import SPZ
     from surfkit.io.splats.tiles3d import Tiles3D
+    from surfkit.io.splats.usd import USD
 
     return {
         "compressed-ply": CompressedPLY,
@@ -27,4 +28,5 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "splat": Splat,
         "spz": SPZ,
         "tiles3d": Tiles3D,
+        "usd": USD,
     }
