@@ -34,7 +34,8 @@ class SortedPoints:
     def __init__(self, file: Path, low: np.ndarray, side: int) -> None:
         self._file, self._low, self._side = file, low, side
         self._waiting: list[np.ndarray] = []
-        self._starts, self._samples = [0], []  # of each run
+        self._starts = [0]
+        self._samples: list[np.ndarray] = []
         file.write_bytes(b"")
 
     def add(self, points: np.ndarray) -> None:

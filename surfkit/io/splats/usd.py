@@ -23,7 +23,7 @@ from surfkit.io.splats.gltf_reader import LOG_SCALE_ROUNDING, MAX_OPACITY, MIN_N
 from surfkit.io.splats.rotate_splats import parts_of, turned
 from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.io.splats.tiles3d import box_of
-from surfkit.io.usd import NOTES, USDZ_SUFFIX, knows_usdz, new_stage, open_usdz, place_prim, require_usd, write_usdz
+from surfkit.io.usdz import NOTES, USDZ_SUFFIX, knows_usdz, new_stage, open_usdz, place_prim, require_usd, write_usdz
 from surfkit.scene.rotations import unit
 from surfkit.scene.scene import MAX_EXTENTS_OFFSET, Frame
 
@@ -41,7 +41,7 @@ SURFLET_SCHEMAS = (
 
 @dataclass(frozen=True)
 class USD(Format):
-    """OpenUSD (.usdz) with ParticleField3DGaussianSplat of OpenUSD 26.03, for Omniverse and programs of film and games."""
+    """OpenUSD (.usdz) with its ParticleField3DGaussianSplat, for Omniverse and other programs of film and games."""
 
     suffix: ClassVar[str] = USDZ_SUFFIX
 

@@ -13,7 +13,7 @@ from surfkit.io.splats.file_axes import turn_between
 from surfkit.io.splats.rotate_splats import turned
 from surfkit.io.splats.splat_files import format_of
 from surfkit.io.splats.usd import USD
-from surfkit.io.usd import write_usdz
+from surfkit.io.usdz import write_usdz
 from surfkit.scene.scene import Frame
 from surfkit.testing.format_checks import check_format, splat_table
 

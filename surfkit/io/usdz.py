@@ -81,8 +81,8 @@ def write_usdz(path: Path, stage: Any, files: Sequence[Path] = ()) -> None:
         for file in (scene, *files):
             writer.AddFile(str(file), file.name)
         writer.Save()
-        with archive.open("rb+") as file:
-            os.fsync(file.fileno())
+        with archive.open("rb+") as written:
+            os.fsync(written.fileno())
         os.replace(archive, path)
     sync_folder(path.parent)
 
