@@ -53,12 +53,8 @@ class TextureCommand:
     def __post_init__(self) -> None:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
-        if self.out is not None and (kind := self.out.suffix.lower().removeprefix(".")) in (
-            "obj",
-            "glb",
-            "json",
-            "usdz",
-        ):
+        kind = self.out.suffix.lower().removeprefix(".") if self.out is not None else ""
+        if kind in ("obj", "glb", "json", "usdz"):
             made = "tiles3d" if kind == "json" else kind
             raise BadInput(f"--out {self.out}: give a folder, and --formats {made}")
 
