@@ -87,8 +87,8 @@ def measured(maps: Path, truth: Path) -> dict[str, float]:
     figures["surface model on ground that is seen: RMS, m"] = rms(before[seen & np.isfinite(model)])
     figures["without terrain"] = float((near & ~there).sum() / near.sum())
     figures["cells"] = int(near.sum())
-    if (maps / "points.laz").exists():
-        figures |= classes(maps / "points.laz", grid, ground, surface, seen)
+    if (maps / "points.copc.laz").exists():
+        figures |= classes(maps / "points.copc.laz", grid, ground, surface, seen)
     return figures
 
 

@@ -12,7 +12,7 @@ from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
     "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "kornia": "features", "laspy": "maps",
-    "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps",
+    "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pxr": "usd", "pyogrio": "maps",
     "rasterio": "maps", "ray": "ray", "shapely": "maps", "submitit": "slurm", "tensorboard": "tensorboard",
     "transformers": "depth", "trimesh": "mesh", "viser": "view",
 }  # fmt: skip
@@ -21,6 +21,7 @@ INSTALLED_AS = {
     "cv2": "opencv-python-headless",
     "fast_simplification": "fast-simplification",
     "pillow_heif": "pillow-heif",
+    "pxr": "usd-core",
 }
 """By package, the name that it is installed by, where that is another one."""
 LIBRARIES = {

@@ -21,10 +21,15 @@ def morton_order(means: np.ndarray, cubes: bool = False) -> np.ndarray:
     code = np.zeros(len(means), np.uint64)
     for begin in range(0, len(means), AT_ONCE):
         some = slice(begin, begin + AT_ONCE)
-        cells = ((means[some] - low) / np.where(extent > 0, extent, 1) * (2**21 - 1)).astype(np.uint64)
-        for axis in range(3):
-            code[some] |= _spread(cells[:, axis]) << np.uint64(axis)
+        code[some] = morton_codes(
+            ((means[some] - low) / np.where(extent > 0, extent, 1) * (2**21 - 1)).astype(np.uint64)
+        )
     return np.argsort(code, kind="stable")
+
+
+def morton_codes(cells: np.ndarray) -> np.ndarray:
+    """(N,) uint64 places along a Z-order curve of (N, 3) uint64 cells below 2^21: x has the lowest bits."""
+    return _spread(cells[:, 0]) | _spread(cells[:, 1]) << np.uint64(1) | _spread(cells[:, 2]) << np.uint64(2)
 
 
 def _spread(values: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ OPENED = {
     "orthophoto": f"{MAPS}/orthophoto.tif",
     "hillshade": f"{MAPS}/hillshade.tif",
     "contour lines": f"{MAPS}/contours.gpkg",
-    "point cloud": f"{MAPS}/points.laz",
+    "point cloud": f"{MAPS}/points.copc.laz",
     "splats": f"{RUN}/point_cloud.ply",
     "cameras": f"{SCENE}/sparse/0",
 }

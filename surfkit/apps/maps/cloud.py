@@ -1,4 +1,4 @@
-"""A cloud of points, spread evenly over a mesh, as LAZ 1.4."""
+"""A cloud of points, spread evenly over a mesh, as a Cloud Optimized Point Cloud: LAZ 1.4 in an octree."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from surfkit.apps.maps.bins import BATCH_TRIANGLES
+from surfkit.apps.maps.copc import POINT_SOURCE_ID, Octree, write_copc
 from surfkit.apps.maps.geotiff import GeoTiffSettings
+from surfkit.apps.maps.sorted_points import POINT, SortedPoints
 from surfkit.apps.maps.surface_model import COLOR_CHANNELS, has_colors
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
@@ -19,8 +21,6 @@ from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
 BATCH_POINTS = 1 << 20
 """Points in memory."""
-POINT_SOURCE_ID = 1
-"""Point source ID: points of the mesh."""
 STEPS_PER_SPACING = 1000
 """Steps of a coordinate within the distance of points."""
 
@@ -52,38 +52,50 @@ def write_cloud(
         from laspy.vlrs.known import WktCoordinateSystemVlr
     with needed("lazrs", "a point cloud in LAZ"):
         import lazrs  # noqa: F401 (what laspy compresses with)
-    west, south, east, north = sheet.grid.bounds
+    step = 10.0 ** math.floor(math.log10(spacing) - math.log10(STEPS_PER_SPACING) + 0.5)
+    low, high = _bounds(surface, sheet)
+    if max(high - low) / 2 / step >= 2**31 - 1:
+        raise BadInput(f"--spacing {spacing:g}: too fine for a LAZ file of this width; give a larger one")
     header = laspy.LasHeader(version="1.4", point_format=7 if has_colors(surface) else 6)
     header.generating_software = f"surfkit {own_version()}"
     header.file_source_id = POINT_SOURCE_ID
-    step = 10.0 ** math.floor(math.log10(spacing) - math.log10(STEPS_PER_SPACING) + 0.5)
-    header.scales = np.full(3, step)
-    first = next(block for block in surface.blocks() if len(block))
-    header.offsets = np.round([(west + east) / 2, (south + north) / 2, sheet.grid.to_map(first)[:, 2].mean()])
-    if max(east - west, north - south) / 2 / step >= 2**31 - 1:
-        raise BadInput(f"--spacing {spacing:g}: too fine for a LAZ file of this width; give a larger one")
+    header.scales, header.offsets = np.full(3, step), np.round((low + high) / 2)
     header.vlrs.append(WktCoordinateSystemVlr(sheet.crs.to_wkt(version="WKT1_GDAL")))
     header.global_encoding.wkt = True
+    corners = np.floor((low - header.offsets) / step), np.ceil((high - header.offsets) / step)
+    octree = Octree.around(*(corner.astype(np.int64) for corner in corners), spacing / step)
     path, counts = sheet.folder / name, np.zeros(256, np.int64)
-    with path.open("wb") as file, laspy.open(file, "w", header=header, do_compress=True, closefd=False) as writer:
-        for places, colors in sample_evenly(surface, spacing**2):
-            places = sheet.grid.to_map(places)
-            inside = ((places[:, :2] >= [west, south]) & (places[:, :2] <= [east, north])).all(1)
-            if sheet.grid.area is not None:
-                inside = inside & sheet.grid.area.contains(places[:, :2])
-            record = laspy.ScaleAwarePointRecord.zeros(int(inside.sum()), header=header)
-            record.x, record.y, record.z = places[inside].T
-            record.return_number[:] = record.number_of_returns[:] = 1
-            record.point_source_id[:] = POINT_SOURCE_ID
-            if colors is not None:
-                for channel, color in enumerate(COLOR_CHANNELS):
-                    record[color] = colors[inside, channel].astype(np.uint16) * 257
-            if classify is not None:
-                record.classification[:] = classify(places[inside])
-            writer.write_points(record)
-            counts += np.bincount(np.asarray(record.classification), minlength=256)
+    spill = path.with_suffix(".points")
+    points = SortedPoints(spill, octree.low, octree.side)
+    for places, colors in sample_evenly(surface, spacing**2):
+        places = sheet.grid.to_map(places)
+        inside = ((places[:, :2] >= low[:2]) & (places[:, :2] <= high[:2])).all(1)
+        if sheet.grid.area is not None:
+            inside = inside & sheet.grid.area.contains(places[:, :2])
+        some = np.zeros(int(inside.sum()), POINT)
+        some["place"] = np.rint((places[inside] - header.offsets) / step)
+        if colors is not None:
+            some["color"] = colors[inside]
+        if classify is not None:
+            some["kind"] = classify(places[inside])
+        points.add(some)
+        counts += np.bincount(some["kind"], minlength=256)
+    with path.open("w+b") as file:
+        write_copc(file, header, octree, points)
+    spill.unlink()
     sheet.deliver(path)
     return {str(number): int(counts[number]) for number in np.flatnonzero(counts)}
+
+
+def _bounds(surface: SurfaceFile, sheet: GeoTiffSettings) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) corners of the box around the part of a mesh that lies on the map, in coordinates of the map."""
+    west, south, east, north = sheet.grid.bounds
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for block in surface.blocks():
+        if len(block):
+            places = sheet.grid.to_map(block)
+            low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
+    return np.maximum(low, [west, south, -np.inf]), np.minimum(high, [east, north, np.inf])
 
 
 def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:

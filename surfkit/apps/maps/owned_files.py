@@ -14,11 +14,13 @@ from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 
 PRODUCT_FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
-    "points": "points.laz", "precision": "precision.tif", "rays": "rays.tif",
+    "points": "points.copc.laz", "precision": "precision.tif", "rays": "rays.tif",
     "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
     "volumes": "volumes.gpkg", "volumes-table": "volumes.csv",
 }  # fmt: skip
+FORMER_FILES = {"points.laz"}
+"""Files that earlier versions wrote; they are replaced with the rest."""
 MAPS_RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""
 UNFINISHED_FOLDER = "unfinished"
@@ -29,7 +31,7 @@ NAMES_FILE = "names.json"
 
 def own_files(out: Path) -> set[str]:
     """Names of the files in a folder that earlier calls wrote: whole maps, or what an interrupted one finished."""
-    known, found = {*PRODUCT_FILES.values()}, set()
+    known, found = {*PRODUCT_FILES.values(), *FORMER_FILES}, set()
     record = _read(out / MAPS_RECORD)
     if "gsd" in record and isinstance(record.get("files"), list):
         found = {MAPS_RECORD, *(known & {*map(str, record["files"])})}

@@ -12,6 +12,7 @@ from surfkit.apps.texture.texture_mesh import TEXTURE_RECORD, MeshWithPhotos, Te
 from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface_file import read_mesh
+from surfkit.io.usdz import require_usd
 from surfkit.mesh.simplify import require_simplification
 from surfkit.runs.command import refuse_no_mesh
 from surfkit.runs.pipeline import opened
@@ -25,7 +26,8 @@ from surfkit.train.progress_bars import bars
 
 @dataclass(frozen=True)
 class TextureCommand:
-    """Give the mesh of a finished run a texture from the photographs; writes OBJ, GLB and 3D Tiles into RUN/texture.
+    """Give the mesh of a finished run a texture from the photographs; writes OBJ, GLB and 3D Tiles, or OpenUSD, into
+    RUN/texture.
 
     Each triangle takes its picture from one photograph that shows it whole, well, and in the colour that others show
     too; seams between photographs are levelled. The mesh is simplified first, which needs `pip install
@@ -51,13 +53,16 @@ class TextureCommand:
     def __post_init__(self) -> None:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
-        if self.out is not None and (kind := self.out.suffix.lower().removeprefix(".")) in ("obj", "glb", "json"):
+        kind = self.out.suffix.lower().removeprefix(".") if self.out is not None else ""
+        if kind in ("obj", "glb", "json", "usdz"):
             made = "tiles3d" if kind == "json" else kind
             raise BadInput(f"--out {self.out}: give a folder, and --formats {made}")
 
     def run(self) -> None:
         """Make the textured mesh, and print what it is."""
         require_simplification("simplifying a mesh")
+        if "usdz" in self.settings.formats:
+            require_usd("--formats usdz")
         budget = cache_bytes(self.memory, "--memory")
         run = opened(self.run_folder)
         refuse_no_mesh(run)

@@ -14,6 +14,7 @@ from surfkit.apps.texture.fill import PaintInput, Pictures, encoded, paint
 from surfkit.apps.texture.obj_glb import SUFFIX, AtlasPageMesh, material_lines, part_of, write_obj, write_textured_glb
 from surfkit.apps.texture.regions import Region
 from surfkit.apps.texture.textured_tileset import TilesetWriter
+from surfkit.apps.texture.textured_usd import write_textured_usdz
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
@@ -90,16 +91,15 @@ def deliver(fine: TexturedMesh, coarser: Iterable[TexturedMesh], how: TextureExp
         for page in pages:
             shutil.copyfile(page, folder / page.name)
         files += [f"{TEXTURED_NAME}.obj", f"{TEXTURED_NAME}.mtl", *(page.name for page in pages)]
-    if "glb" in how.kinds:
-        extras = {"offset": list(frame.shift), "crs": frame.crs, "metres_per_unit": frame.metres}
+    for kind in sorted(how.kinds & {"glb", "usdz"}):
+        name = f"{TEXTURED_NAME}.{kind}"
         try:
-            turn, name = UPS["z"] @ level, f"{TEXTURED_NAME}.glb"
-            write_textured_glb(folder / name, what.mesh, parts, pages, how.pictures, frame.to_file, turn, extras)
+            _write_whole(folder / name, what, parts, pages, how, level)
             files.append(name)
         except BadInput as error:  # larger than such a file can be: the rest is not to be lost
-            if how.kinds == {"glb"}:
+            if how.kinds == {kind}:
                 raise
-            emit(Warned(f"{TEXTURED_NAME}.glb is left out: {error}".replace(f"{folder / name}: ", "")))
+            emit(Warned(f"{name} is left out: {error}".replace(f"{folder / name}: ", "")))
     if "tiles3d" in how.kinds:
         tiles = TilesetWriter(folder / TILES_FOLDER, frame, level, how.pictures, how.geoid)
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
@@ -109,6 +109,25 @@ def deliver(fine: TexturedMesh, coarser: Iterable[TexturedMesh], how: TextureExp
         tiles.finish(fine.region)
         files.append(f"{TILES_FOLDER}/tileset.json")
     return files
+
+
+def _write_whole(
+    path: Path,
+    what: PaintInput,
+    parts: Sequence[AtlasPageMesh],
+    pages: Sequence[Path],
+    how: TextureExport,
+    level: np.ndarray,
+) -> None:
+    """Write the mesh with its pages as one file, GLB or USDZ; `level` is (3, 3), from its coordinates to z up."""
+    frame = how.frame
+    if path.suffix == ".usdz":
+        notes = {"offset": tuple(frame.shift), "crs": frame.crs}
+        write_textured_usdz(path, what.mesh, parts, pages, frame.to_file, level, frame.metres, notes)
+    else:
+        extras = {"offset": list(frame.shift), "crs": frame.crs, "metres_per_unit": frame.metres}
+        turn = UPS["z"] @ level
+        write_textured_glb(path, what.mesh, parts, pages, how.pictures, frame.to_file, turn, extras)
 
 
 def painted(what: PaintInput, kind: Pictures, folder: Path) -> tuple[list[AtlasPageMesh], list[Path]]:

@@ -41,7 +41,7 @@ from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.radiometry import Radiometry, camera_numbers, estimate
 from surfkit.scene.scene import Frame, View
 
-Format = Literal["obj", "glb", "tiles3d"]
+Format = Literal["obj", "glb", "tiles3d", "usdz"]
 TEXTURE_RECORD = "texture.json"
 """What the textured mesh is; written last."""
 UNFINISHED_SUFFIX = ".unfinished"
@@ -64,8 +64,8 @@ class TextureSettings:
     """What is written, and how fine it is."""
 
     formats: tuple[Format, ...] = ("obj", "glb", "tiles3d")
-    """Files to write: obj (with an MTL file and pictures), glb, and tiles3d, a folder with tileset.json for CesiumJS
-    and other viewers of 3D Tiles."""
+    """Files to write: obj (with an MTL file and pictures), glb, tiles3d, a folder with tileset.json for CesiumJS and
+    other viewers of 3D Tiles, and usdz, OpenUSD, which needs `pip install 'surfkit[usd]'`."""
 
     triangles: int | Literal["auto"] = "auto"
     """Triangles to simplify the mesh to; where the surface is flat, large ones are divided again. `auto` is one for 6
@@ -92,7 +92,7 @@ class TextureSettings:
 
     def __post_init__(self) -> None:
         if not self.formats:
-            raise BadInput("--formats: name at least one of obj, glb, tiles3d")
+            raise BadInput("--formats: name at least one of obj, glb, tiles3d, usdz")
         if self.geoid is not None and "tiles3d" not in self.formats:
             raise BadInput("--geoid: only 3D Tiles need it; add tiles3d to --formats, or leave --geoid out")
         if self.triangles != "auto" and not 4 <= self.triangles <= 10**9:

@@ -18,6 +18,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     from surfkit.io.splats.spz import SPZ
     from surfkit.io.splats.streamed_sog import StreamedSOG
     from surfkit.io.splats.tiles3d import Tiles3D
+    from surfkit.io.splats.usd import USD
 
     return {
         "compressed-ply": CompressedPLY,
@@ -29,4 +30,5 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "spz": SPZ,
         "streamed-sog": StreamedSOG,
         "tiles3d": Tiles3D,
+        "usd": USD,
     }

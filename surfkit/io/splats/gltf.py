@@ -99,7 +99,7 @@ def write_splats(path: Path, table: SplatTable, turn: np.ndarray, compress: Comp
         notes: What `asset.extras.surfkit` says besides how to read the splats back.
     """
     table = table.on_cpu()
-    centre = _centre(table, 0.0 if compress == "spz" else MAX_EXTENTS_OFFSET)
+    centre = centre_of(table, 0.0 if compress == "spz" else MAX_EXTENTS_OFFSET)
     table = replace(table, means=table.means.double() - torch.from_numpy(centre)) if centre.any() else table
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, turn @ centre
@@ -128,7 +128,7 @@ def extensions_of(compress: Compress) -> list[str]:
     return [SPLATS, COMPRESSED] if compress == "spz" else [SPLATS]
 
 
-def _centre(table: SplatTable, far: float) -> np.ndarray:
+def centre_of(table: SplatTable, far: float) -> np.ndarray:
     """(3,) float64: a whole number near the middle on axes on which that is `far` extents from 0, and 0 on others."""
     if not len(table):
         return np.zeros(3)

@@ -70,7 +70,7 @@ def read_splats(path: Path) -> SplatTable:
     ]
     if not tables and not notes:
         raise document.fault(f"no file of splats: no primitive of its scene has the extension {SPLATS}")
-    table = _joined(tables, notes.get("sh_degree", 0))
+    table = joined(tables, notes.get("sh_degree", 0))
     if not notes:
         axes = FileAxes(GLTF_AXES, str(document.entry("asset", "generator")).startswith(WRITERS))
         is_coarse = COMPRESSED in _list(document, document.root, "extensionsUsed")
@@ -208,7 +208,7 @@ def harmonics(degree: int) -> Iterator[tuple[str, int]]:
             yield f"SH_DEGREE_{band}_COEF_{order}", band * band - 1 + order
 
 
-def _joined(tables: list[SplatTable], degree: int) -> SplatTable:
+def joined(tables: list[SplatTable], degree: int) -> SplatTable:
     """All splats in one table, with the harmonics of the highest degree; one without splats has `degree`."""
     if not tables:
         zeros = {"means": 3, "quats": 4, "log_scales": 3, "sh0": 3}

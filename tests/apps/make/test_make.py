@@ -130,7 +130,7 @@ def test_what_is_not_installed_is_told_first_and_added_later(farm, monkeypatch, 
     assert set(record(farm)["left_out"]) == {"texture", "points"}
     assert record(farm)["decisions"]["forecast"]["seconds"] > 0
     out = farm.parent / "delivery"
-    assert (out / "maps/dsm.tif").exists() and not (out / "maps/points.laz").exists()
+    assert (out / "maps/dsm.tif").exists() and not (out / "maps/points.copc.laz").exists()
     seen = calls(monkeypatch)
     assert make(farm) == 0 and seen == ["texture", "maps"] and record(farm)["left_out"] == {}
 

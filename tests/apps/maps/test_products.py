@@ -155,8 +155,8 @@ def test_a_laz_file_is_read_back(tmp_path):
     grid = grid_of(0.25, *UTM, UTM[0] + 20, UTM[1] + 10)
     crs, _ = map_crs(FRAME)
     with workshop(tmp_path, ()) as folder:
-        count = write_cloud(surface, GeoTiffSettings(grid, crs, folder, tmp_path), "points.laz", 0.2)["0"]
-    with laspy.open(tmp_path / "points.laz") as file:
+        count = write_cloud(surface, GeoTiffSettings(grid, crs, folder, tmp_path), "points.copc.laz", 0.2)["0"]
+    with laspy.open(tmp_path / "points.copc.laz") as file:
         header, points = file.header, file.read()
     assert (str(header.version), header.point_format.id, header.are_points_compressed) == ("1.4", 7, True)
     assert header.global_encoding.wkt and len(points) == count
@@ -314,7 +314,7 @@ def test_all_products_of_a_hill(tmp_path):
     settings = MapSettings(gsd=0.25, interval=5.0, shortest=0.0, tile=50)
     record = make_maps(MeshWithPhotos(surface, FRAME), settings, tmp_path)
     assert json.loads((tmp_path / "maps.json").read_text()) == record
-    assert record["files"] == ["dsm.tif", "orthophoto.tif", "hillshade.tif", "contours.gpkg", "points.laz"]
+    assert record["files"] == ["dsm.tif", "orthophoto.tif", "hillshade.tif", "contours.gpkg", "points.copc.laz"]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*record["files"], "maps.json"])
     assert record["covered"] == 1 and record["gsd"] == 0.25 and record["size"] == [120, 120]
     meta, _, shapes, (levels,) = read(tmp_path / "contours.gpkg")
@@ -342,7 +342,7 @@ def test_level_ground_and_heights_in_millions(tmp_path):
     flat = heightfield(lambda x, y: 0 * x + 6_371_000.125, UTM, (UTM[0] + 5, UTM[1] + 5))
     record = make_maps(MeshWithPhotos(flat, FRAME), MapSettings(("contours", "points"), 0.1), tmp_path)
     assert record["contours"]["lines"] == 0 and len(read(tmp_path / "contours.gpkg")[2]) == 0
-    assert np.abs(laspy.read(tmp_path / "points.laz").z - 6_371_000.125).max() < 1e-3
+    assert np.abs(laspy.read(tmp_path / "points.copc.laz").z - 6_371_000.125).max() < 1e-3
     with rasterio.open(tmp_path / "dsm.tif") as file:
         assert file.dtypes == ("float64",) and (file.read(1) == 6_371_000.125).all()
 

@@ -108,7 +108,7 @@ def test_results_do_not_depend_on_tiles(tmp_path, monkeypatch):
         out = tmp_path / str(tile)
         record = make_maps(MeshWithPhotos(surface, FRAME), MapSettings(tile=tile, **settings), out)
         rasters = [read(out / name).tobytes() for name in ("dtm.tif", "ndsm.tif", "ground-distance.tif")]
-        found.append((*rasters, record["terrain"], (out / "points.laz").read_bytes()))
+        found.append((*rasters, record["terrain"], (out / "points.copc.laz").read_bytes()))
     assert found[0] == found[1]
 
 
@@ -119,7 +119,7 @@ def test_points_have_classes(tmp_path):
     for colored in (True, False):
         out = tmp_path / str(colored)
         record = make_maps(MeshWithPhotos(scene(hills, colored=colored), FRAME), settings, out)
-        points = laspy.read(out / "points.laz")
+        points = laspy.read(out / "points.copc.laz")
         kinds, x, y = np.asarray(points.classification), points.x - UTM[0], points.y - UTM[1]
         assert record["points"]["classes"] == {str(kind): int((kinds == kind).sum()) for kind in np.unique(kinds)}
         above, house, tree = things(np.asarray(x), np.asarray(y))
