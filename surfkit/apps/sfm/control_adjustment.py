@@ -10,6 +10,7 @@ difference from the cameras that control points place is taken away.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,7 +41,9 @@ RMS_FACTOR = 3.0
 """A surveyed place is wrong only where it is off by so many times as much as the others."""
 MAX_ADJUSTMENTS = 12
 """To find wrong points: each takes one."""
-MEAN_OF_RAYLEIGH = np.sqrt(np.pi / 2)
+MIN_TIE_SIGMA = 0.05
+"""No tie point is more exact, pixels."""
+MEAN_OF_RAYLEIGH = math.sqrt(math.pi / 2)
 """Mean length of residuals whose two coordinates have a standard deviation of 1."""
 
 
@@ -65,7 +68,7 @@ def tie_sigma(model: Any) -> float:
     """Standard deviation of a coordinate of the tie points of a pycolmap.Reconstruction, pixels, by its residuals."""
     count = model.compute_num_observations()
     free = 2 * count - 3 * model.num_points3D() - 6 * model.num_reg_images()
-    return max(mean_error(model) / MEAN_OF_RAYLEIGH * np.sqrt(2 * count / max(free, count / 2)), 0.05)
+    return max(mean_error(model) / MEAN_OF_RAYLEIGH * math.sqrt(2 * count / max(free, count / 2)), MIN_TIE_SIGMA)
 
 
 def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[GroundControl, list[WrongMark]]:
@@ -130,7 +133,7 @@ def adjust_to_points(
     facts = {
         "kept": good,
         "tie_sigma_px": round(tie, 3),
-        "mark_sigma_px": round(tie / np.sqrt(weights.copies), 3),
+        "mark_sigma_px": round(tie / math.sqrt(weights.copies), 3),
         "positions": 0 if block.positions is None else len(block.positions.names),
         "no_positions": said,
         "positions_offset_m": None if block.offset is None else [round(float(v), 3) for v in block.offset],
