@@ -2,12 +2,13 @@
 
     python bench/control.py SHIBUYA
 
-SHIBUYA is the folder shibuya-synth, of which the exact mesh (gt/mesh.ply) and the exact cameras (sparse/0) are used,
-and no photographs: once all, once those that look straight down. Samples of the mesh (gt/points.ply) are projected by a lens with distortion where depth maps of the mesh
-show them: tie points with noise of 0.5 px, eight control points and eight checkpoints with marks of 0.3 px. One mark is
-15 px off. Positions of the photographs have a common error and noise. Cameras are found by pycolmap's triangulation
-and adjustment, from the focal length of EXIF, which is wrong by 2 %. Then the functions of `surfkit prepare photos`
-place the model: by positions, by the similarity of the control points, and by the adjustment with them.
+SHIBUYA is the folder shibuya-synth, of which the exact cameras (sparse/0) and the exact mesh (gt/) are used, and no
+photographs: once all cameras, once those that look straight down. Samples of the mesh are projected by a lens with
+distortion where depth maps of the mesh show them: tie points with noise of 0.5 px, eight control points and eight
+checkpoints with marks of 0.3 px. One mark is 15 px off. Positions of the photographs have a common error and noise.
+Cameras are found by pycolmap's adjustment from poses that are off, and the focal length of EXIF, which is wrong by 2 %.
+Then the functions of `surfkit prepare photos` place the model: by positions, by the similarity of the control points,
+and by the adjustment with them.
 
 Judged are residuals of the checkpoints, to the exact places. GSD is the mean distance of the ground over the focal
 length. Results go to bench/results/control.json.

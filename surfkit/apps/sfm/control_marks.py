@@ -116,12 +116,11 @@ def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str
     step = STEP_SHARE * min(float(np.linalg.norm(xyz - np.array(images[name].projection_center()))) for name in marks)
     slopes = []
     for name in marks:
-        ways = [
-            mark_residuals(images, {name: (0.0, 0.0)}, xyz + step * way).get(name) for way in (*np.eye(3), *-np.eye(3))
-        ]
-        if any(way is None for way in ways):
+        pixels = [projected(images[name], xyz + step * way) for way in (*np.eye(3), *-np.eye(3))]
+        ways = [pixel for pixel in pixels if pixel is not None]
+        if len(ways) < len(pixels):
             return {}
-        slopes.append(np.stack([(ways[at] - ways[at + 3]) / (2 * step) for at in range(3)], 1))
+        slopes.append(np.stack([(ways[at + 3] - ways[at]) / (2 * step) for at in range(3)], 1))
     slope = np.concatenate(slopes)
     moved, *_ = np.linalg.lstsq(slope, np.concatenate(list(left.values())), rcond=None)
     rest = np.concatenate(list(left.values())) - slope @ moved

@@ -161,9 +161,9 @@ class SfmPreparation:
 
     def _site(self, positions: Positions) -> GroundControl | list[PositionHypothesis]:
         """Ground control points on their map; else what the positions may mean, nothing where there are none."""
-        if self.settings.gcp is not None:
+        given = self.settings
+        if given.gcp is not None:
             sizes = {photo.name: photo.size for photo in positions.photos}
-            given = self.settings
             return read_ground(given.gcp, given.crs, sizes, given.checkpoints, given.checkpoint_names)
         return readings(positions, self.settings.crs) if self.settings.gps else []
 

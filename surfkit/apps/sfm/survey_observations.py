@@ -210,7 +210,7 @@ class _Extra:
                 pose = self.engine.Rigid3d(self.engine.Rotation3d(turn), np.array([0, 0, distance]) - turn @ middle)
                 ray = (places[same] - middle) @ turn.T + (0, 0, distance)
                 image = self._fixed(focal, pose, ray[:, :2] / ray[:, 2:] * focal)
-                for at, row_at in enumerate(same):
+                for at, row_at in enumerate(same.tolist()):
                     tracks[row_at].add_element(image, at)
 
     def _camera(self, focal: Sequence[float] | np.ndarray) -> int:
