@@ -269,7 +269,7 @@ def measured(
         raise BadInput(where.reason)
     where = replace(where, wrong_marks=tuple(marks))
     by_points = moved(model, where.similarity)
-    gsd = height_above_ground(by_points) / LENS[0]
+    gsd = float(height_above_ground(by_points) / LENS[0])
     found: dict[str, Any] = {"GSD, m": gsd, "marks": sum(len(point.marks) for point in ground.points)}
     tried = adjust(placed, by_gps, photos, settings)
     if tried is None:

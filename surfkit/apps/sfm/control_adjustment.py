@@ -20,7 +20,7 @@ import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import MAX_ERROR_RATIO, mean_error, taken_over
 from surfkit.apps.sfm.control_list import GroundControl
-from surfkit.apps.sfm.control_marks import WrongMark, images_of, triangulate, without_wrong_marks
+from surfkit.apps.sfm.control_marks import WrongMark, images_of, located, triangulate, without_wrong_marks
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import known_focals
 from surfkit.apps.sfm.georeference import NEAR_M, MapProjection, NoSimilarity, centres_of, place
@@ -38,7 +38,8 @@ CACHE_VERSION = "1"
 MAX_CHI2 = 25.0
 """By which the sum of squares may fall without a surveyed place: that of chance falls by more in 1 of 60,000 cases."""
 RMS_FACTOR = 3.0
-"""A surveyed place is wrong only where it is off by so many times as much as the others."""
+"""A surveyed place is wrong only where it is off by so many times as much as the others, each against how exactly its
+marks tell where it is: what a lens does beyond its model shows in all of them."""
 MAX_ADJUSTMENTS = 12
 """To find wrong points: each takes one."""
 MIN_TIE_SIGMA = 0.05
@@ -163,6 +164,14 @@ def _told(model: Any, where: ControlResiduals, ground: GroundControl, outcome: O
     )
 
 
+@dataclass(frozen=True)
+class _Off:
+    """How far a surveyed place is from its point in a model: metres, and squared in standard deviations of both."""
+
+    metres: float
+    chi2: float
+
+
 class _Block:
     """A model that is adjusted again and again, and the points that are part of it."""
 
@@ -182,6 +191,8 @@ class _Block:
         self.offset: np.ndarray | None = None
         self.count = 0
         self.last: Adjusted
+        up = settings.gcp_sigma if settings.gcp_sigma_up is None else settings.gcp_sigma_up
+        self._sigma = np.array([settings.gcp_sigma, settings.gcp_sigma, up]) / weights.metres
 
     def solve(self) -> None:
         """Adjust with the points inside."""
@@ -216,7 +227,7 @@ class _Block:
         """Take in the surveyed places that the similarity did not fit, one after the other, while they fit now."""
         while self.outside and self.count < MAX_ADJUSTMENTS:
             off = self._off()
-            name = min(self.outside, key=lambda one: off[one])
+            name = min(self.outside, key=lambda one: off[one].chi2)
             trial = self._solved([*self.inside, name])
             if not trial.usable or self._is_wrong(name, trial.chi2 - self.last.chi2, off):
                 return
@@ -227,29 +238,24 @@ class _Block:
         """Leave out surveyed places that contradict the rest, that which is off most first."""
         while len(self.inside) > MIN_AGREEING_POSITIONS and self.count < MAX_ADJUSTMENTS:
             off = self._off()
-            name = max(self.inside, key=lambda one: off[one])
-            rest = [one for one in self.inside if one != name]
-            if off[name] <= self.settings.gcp_sigma:
-                return
-            before, self.last = self.last, self._solved(rest)
+            name = max(self.inside, key=lambda one: off[one].chi2)
+            before, self.last = self.last, self._solved([one for one in self.inside if one != name])
             if not self.last.usable or not self._is_wrong(name, before.chi2 - self.last.chi2, self._off()):
                 self.last = before
                 return
-            self.inside, self.outside = rest, [*self.outside, name]
+            self.inside, self.outside = [one for one in self.inside if one != name], [*self.outside, name]
 
-    def _is_wrong(self, name: str, chi2: float, off: Mapping[str, float]) -> bool:
+    def _is_wrong(self, name: str, chi2: float, off: Mapping[str, _Off]) -> bool:
         """Whether a point contradicts, by the difference of the sums of squares with and without its place, and by how
         far it and the others are off without it."""
-        others = [off[one] for one in self.inside if one != name]
-        rms = float(np.sqrt(np.mean(np.square(others))))
-        return chi2 > MAX_CHI2 and off[name] > max(NEAR_M / 2, RMS_FACTOR * rms)
+        others = float(np.mean([off[one].chi2 for one in self.inside if one != name]))
+        far = off[name].metres > NEAR_M / 2 and off[name].chi2 > max(MAX_CHI2, RMS_FACTOR**2 * others)
+        return far and chi2 > MAX_CHI2
 
     def _solved(self, inside: Sequence[str]) -> Adjusted:
         self.count += 1
-        up = self.settings.gcp_sigma if self.settings.gcp_sigma_up is None else self.settings.gcp_sigma_up
-        sigma = np.array([self.settings.gcp_sigma, self.settings.gcp_sigma, up]) / self.weights.metres
         points = [
-            SurveyedPoint(xyz, onto if name in inside else None, sigma, marks)
+            SurveyedPoint(xyz, onto if name in inside else None, self._sigma, marks)
             for name, xyz, onto, marks in self._points(self.checkpoints)
         ]
         return adjust_together(self.model, points, self.positions, self.weights)
@@ -263,14 +269,17 @@ class _Block:
                 found.append((point.name, xyz, onto, marks))
         return found
 
-    def _off(self) -> dict[str, float]:
-        """How far each point is off in the adjusted model, metres."""
-        images, metres = images_of(self._adjusted()), self.ground.chart.metres
-        rows = zip(self.ground.points, self.ground.onto, strict=True)
-        found = {point.name: (onto, triangulate(images, point.marks)) for point, onto in rows}
-        return {
-            name: float(np.linalg.norm(onto - xyz)) * metres for name, (onto, xyz) in found.items() if xyz is not None
-        }
+    def _off(self) -> dict[str, _Off]:
+        """How far each point is off in the adjusted model."""
+        images, found = images_of(self._adjusted()), dict[str, _Off]()
+        sigma_px = float(np.hypot(self.weights.mark, self.weights.tie))
+        for point, onto in zip(self.ground.points, self.ground.onto, strict=True):
+            if (there := located(images, point.marks, sigma_px)) is not None:
+                xyz, covariance = there
+                left = onto - xyz
+                chi2 = float(left @ np.linalg.solve(covariance + np.diag(self._sigma**2), left))
+                found[point.name] = _Off(float(np.linalg.norm(left)) * self.weights.metres, chi2)
+        return found
 
     def _adjusted(self) -> Any:
         return taken_over(load_engine(), self.model, self.last.model)

@@ -113,15 +113,9 @@ def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str
     left = {} if xyz is None else mark_residuals(images, marks, xyz)
     if xyz is None or len(left) < len(marks):
         return {}
-    step = STEP_SHARE * min(float(np.linalg.norm(xyz - np.array(images[name].projection_center()))) for name in marks)
-    slopes = []
-    for name in marks:
-        pixels = [projected(images[name], xyz + step * way) for way in (*np.eye(3), *-np.eye(3))]
-        ways = [pixel for pixel in pixels if pixel is not None]
-        if len(ways) < len(pixels):
-            return {}
-        slopes.append(np.stack([(ways[at + 3] - ways[at]) / (2 * step) for at in range(3)], 1))
-    slope = np.concatenate(slopes)
+    slope = _slope(images, marks, xyz)
+    if slope is None:
+        return {}
     moved, *_ = np.linalg.lstsq(slope, np.concatenate(list(left.values())), rcond=None)
     rest = np.concatenate(list(left.values())) - slope @ moved
     spare = np.eye(len(slope)) - slope @ np.linalg.pinv(slope)
@@ -130,6 +124,31 @@ def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str
         name: float(rest[part] @ np.linalg.pinv(spare[part, part], rcond=MIN_REDUNDANCY) @ rest[part])
         for name, part in parts.items()
     }
+
+
+def _slope(images: Images, marks: Mapping[str, tuple[float, float]], xyz: np.ndarray) -> np.ndarray | None:
+    """(2 N, 3) by how much the residuals of N marks change as a place (3,) moves, pixels; None where one does not see
+    it."""
+    step = STEP_SHARE * min(float(np.linalg.norm(xyz - np.array(images[name].projection_center()))) for name in marks)
+    slopes = []
+    for name in marks:
+        pixels = [projected(images[name], xyz + step * way) for way in (*np.eye(3), *-np.eye(3))]
+        ways = [pixel for pixel in pixels if pixel is not None]
+        if len(ways) < len(pixels):
+            return None
+        slopes.append(np.stack([(ways[at + 3] - ways[at]) / (2 * step) for at in range(3)], 1))
+    return np.concatenate(slopes)
+
+
+def located(
+    images: Images, marks: Mapping[str, tuple[float, float]], sigma_px: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """(3,) the place of a point, and its (3, 3) covariance for marks of a standard deviation in pixels; None where
+    their rays do not meet."""
+    marks = {name: pixel for name, pixel in marks.items() if name in images}
+    xyz = triangulate(images, marks)
+    slope = None if xyz is None else _slope(images, marks, xyz)
+    return None if xyz is None or slope is None else (xyz, sigma_px**2 * np.linalg.pinv(slope.T @ slope))
 
 
 def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, float]]) -> np.ndarray | None:
