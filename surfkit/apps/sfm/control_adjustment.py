@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import MAX_ERROR_RATIO, mean_error, taken_over
-from surfkit.apps.sfm.control_list import GroundControl
+from surfkit.apps.sfm.control_list import MIN_CONTROL_POINTS, GroundControl
 from surfkit.apps.sfm.control_marks import WrongMark, images_of, located, triangulate, without_wrong_marks
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import known_focals
@@ -212,16 +212,18 @@ class _Block:
         return None
 
     def drop_marks(self) -> list[WrongMark]:
-        """Leave out marks that contradict the adjusted cameras, and adjust again if there are some."""
+        """Leave out marks that contradict the adjusted cameras, and adjust again if there are some; none where too few
+        points would be left."""
         ground, wrong = clean_marks(self._adjusted(), self.ground, self.settings)
-        if wrong and self.last.usable:
-            self.ground = ground
-            seen = {name for name, *_ in self._points(())}
-            self.inside = [name for name in self.inside if name in seen]
-            self.outside = [name for name in self.outside if name in seen]
-            self.solve()
-            return wrong
-        return []
+        before, self.ground = self.ground, ground
+        seen = {name for name, *_ in self._points(())}
+        inside = [name for name in self.inside if name in seen]
+        if not wrong or not self.last.usable or len(inside) < MIN_CONTROL_POINTS:
+            self.ground = before
+            return []
+        self.inside, self.outside = inside, [name for name in self.outside if name in seen]
+        self.solve()
+        return wrong
 
     def readmit(self) -> None:
         """Take in the surveyed places that the similarity did not fit, one after the other, while they fit now."""

@@ -54,8 +54,8 @@ def warnings_of(where: ControlResiduals) -> Iterator[str]:
         away = {name: float(np.linalg.norm(where.residuals[name])) for name in where.wrong}
         said = [f"{name} ({away[name]:.2f} m)" for name in where.wrong]
         yield (
-            f"{len(said)} ground control points contradict the others and are left out: {few(said)}; their marks "
-            "agree, so their surveyed places are wrong, or the marks are on something else"
+            f"{len(said)} ground control points contradict the others and are left out: {few(said)}; the marks of each "
+            "agree, so its surveyed place is wrong, or they are all on something else"
         )
     if where.unseen:
         yield (
@@ -86,7 +86,7 @@ def write_tables(scene: Path, model: Any, where: ControlResiduals | None, ground
         rows.append([point.name, role, *map(repr, point.xyz), *residual, len(used)])
         for name, pixel in point.marks.items():
             off = [f"{value:.3f}" for value in used[name]] if name in used else ["", ""]
-            what = "wrong" if (point.name, name) in wrong else "yes" if name in used else "no camera"
+            what = "wrong" if (point.name, name) in wrong else "yes" if name in used else "no"
             marks.append([point.name, role, name, *map(repr, pixel), *off, what])
     _write_csv(scene / POINTS_TABLE, POINT_COLUMNS, rows)
     _write_csv(scene / MARKS_TABLE, MARK_COLUMNS, marks)
@@ -141,13 +141,11 @@ def draw_points(axes: Any, where: ControlResiduals, width: float) -> None:
     for role, (symbol, colour) in SYMBOLS.items():
         rows = [at for at, name in enumerate(names) if where.role(name) == role]
         if rows:
-            axes.scatter(*places[rows].T, marker=symbol, s=40, facecolors="none" if symbol != "X" else colour,
-                         edgecolors=colour, zorder=3, label=f"{len(rows)} {role} point{'s' * (len(rows) > 1)}"
-                         if role != "checkpoint" else f"{len(rows)} checkpoint{'s' * (len(rows) > 1)}")  # fmt: skip
-    axes.quiver(
-        *places[good].T, *(times * left[good]).T, angles="xy", scale_units="xy", scale=1, width=0.003, zorder=4,
-        color="black",
-    )  # fmt: skip
+            what = {"control": "control points", "checkpoint": "checkpoints", "left out": "points left out"}[role]
+            edge = dict(facecolors="none" if symbol != "X" else colour, edgecolors=colour)
+            axes.scatter(*places[rows].T, marker=symbol, s=40, zorder=3, label=f"{len(rows)} {what}", **edge)
+    arrows = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.003, "color": "black"}
+    axes.quiver(*places[good].T, *(times * left[good]).T, zorder=4, **arrows)
     axes.plot([], [], color="black", linewidth=1.5, label=f"residual in plan, {times:g} times")
     for name, at in zip(names, places, strict=True):
         axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=7)

@@ -168,7 +168,7 @@ def test_a_wrong_place_is_told_from_a_wrong_mark(flown, tmp_path):
         assert found is not None and where.wrong == ("G4",) and not where.wrong_marks
         assert where.residuals["G4"] == pytest.approx(move, abs=0.2)
         (line,) = warnings_of(where)
-        assert "1 ground control points contradict" in line and "G4" in line and "their marks agree" in line
+        assert "1 ground control points contradict" in line and "G4" in line and "the marks of each agree" in line
         assert off(where) < 0.15
 
 
