@@ -18,7 +18,7 @@ import numpy as np
 from surfkit.apps.sfm.engine import load_engine, run
 from surfkit.apps.sfm.focal import add_marks
 
-FAR = 1e6
+FAR_EXTENTS = 1e6
 """Distance of cameras that see surveyed places, in extents of the survey: perspective bends less than 1e-6 of that."""
 CENTRE_SIGMA_M = 0.001
 """Standard deviation by which the point that stands for a camera is in its centre."""
@@ -201,7 +201,7 @@ class _Extra:
         if not len(places):
             return
         middle = places.mean(0)
-        distance = FAR * max(float(np.abs(places - middle).max()), float(sigma.max()), 1.0)
+        distance = FAR_EXTENTS * max(float(np.abs(places - middle).max()), float(sigma.max()), 1.0)
         for row in np.unique(sigma, axis=0):
             same = np.flatnonzero((sigma == row).all(1))
             for turn, (across, down) in ((ABOVE, (row[0], row[1])), (SOUTH, (np.inf, row[2]))):
