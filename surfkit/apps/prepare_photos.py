@@ -12,6 +12,7 @@ import torch
 import tyro
 
 from surfkit.apps.prepare_depth import OVERVIEW, PrepareDepthCommand
+from surfkit.apps.sfm.control_report import point_rows
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
 from surfkit.apps.sfm.sfm_pipeline import CAMERAS_PICTURE, SfmPreparation
@@ -247,6 +248,8 @@ def show(report: dict[str, Any], scene: Path) -> None:
         rows.append(("depth maps", f"of {maps['photographs']} of {maps['of']} photographs that are trained on"))
     rows.append(("seconds", ", ".join(f"{name} {value:.0f}" for name, value in report["seconds"].items())))
     print_table(("cameras", "value"), rows)
+    if ground := first.get("ground_control"):
+        print_table(("point", "role", "east, m", "north, m", "up, m", "marks, px (RMS)"), point_rows(ground))
     lost = report["not_registered"]
     for name, why in list(lost.items())[:LISTED_PHOTOS]:
         tell(f"no camera for {name!r}: {why}")

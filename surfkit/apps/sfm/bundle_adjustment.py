@@ -73,8 +73,8 @@ def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo],
         return engine.create_pose_prior_bundle_adjuster(options, trust, config, priors, new).solve()
 
     summary = run("adjusting cameras", solve)
-    found = _taken_over(engine, model, new)
-    before, after = _error(engine.Reconstruction(model)), _error(found)
+    found = taken_over(engine, model, new)
+    before, after = mean_error(engine.Reconstruction(model)), mean_error(found)
     return found if summary.is_solution_usable() and after <= MAX_ERROR_RATIO * before else None
 
 
@@ -93,7 +93,7 @@ def _priors(engine: Any, model: Any, placement: Placement) -> list[Any]:
     return priors
 
 
-def _taken_over(engine: Any, model: Any, adjusted: Any) -> Any:
+def taken_over(engine: Any, model: Any, adjusted: Any) -> Any:
     """The model with the cameras, poses and points of an adjusted one, which may have more."""
     new = engine.Reconstruction(model)
     for number, camera in new.cameras.items():
@@ -105,6 +105,6 @@ def _taken_over(engine: Any, model: Any, adjusted: Any) -> Any:
     return new
 
 
-def _error(model: Any) -> float:
+def mean_error(model: Any) -> float:
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())

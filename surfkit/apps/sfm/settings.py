@@ -64,10 +64,23 @@ class Settings:
     is a map, else the zone of UTM."""
 
     gcp: Path | None = None
-    """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""
+    """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS,
+    and are part of the bundle adjustment."""
+
+    gcp_sigma: float = 0.02
+    """Standard deviation of each coordinate of the surveyed points, metres."""
+
+    gcp_sigma_up: float | None = None
+    """That of their heights, if it is another one."""
+
+    mark_sigma: float = 0.5
+    """Standard deviation of each coordinate of their marks in photographs, pixels of the file."""
 
     checkpoints: int = 0
     """How many of them are held back, to report how far they are off."""
+
+    checkpoint_names: tuple[str, ...] = ()
+    """Which of them are held back, by name, instead of so many."""
 
     frames: int = 300
     """Frames that are taken of a video at most: sharp ones, one for each step that the picture moves."""
@@ -96,6 +109,13 @@ class Settings:
         }
         require_within({"frame_step": (0.005, 0.5)}, self)
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
+        require_within({"gcp_sigma": (0.001, 100.0), "mark_sigma": (0.05, 100.0)}, self)
+        if self.gcp_sigma_up is not None:
+            require_within({"gcp_sigma_up": (0.001, 100.0)}, self)
+        if self.checkpoint_names and self.gcp is None:
+            raise BadInput("--checkpoint-names holds back points of --gcp FILE, which is not given")
+        if self.checkpoint_names and self.checkpoints:
+            raise BadInput("--checkpoints and --checkpoint-names both say what is held back; leave out one of the two")
         if self.checkpoints and self.gcp is None:
             raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
         if self.crs != "auto" and not self.gps and self.gcp is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ import torch
 
 from surfkit.apps.sfm.bundle_adjustment import adjust_once
 from surfkit.apps.sfm.colmap_database import matched
+from surfkit.apps.sfm.control_adjustment import adjust_to_points_once, clean_marks
+from surfkit.apps.sfm.control_list import GroundControl, read_ground
+from surfkit.apps.sfm.control_report import warnings_of, write_tables
 from surfkit.apps.sfm.dataset_export import deliver
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
 from surfkit.apps.sfm.georeference import NoSimilarity, Placement, centres_of
 from surfkit.apps.sfm.gravity_alignment import points_of, turn_upright, up_of
-from surfkit.apps.sfm.ground_control import ControlResiduals, GroundControl, doubts, place_by_points, read_ground
+from surfkit.apps.sfm.ground_control import ControlResiduals, doubts, place_by_points
 from surfkit.apps.sfm.inspect_photos import PHOTOGRAPHS_FILE, Photo, known_photographs
 from surfkit.apps.sfm.map_choice import PositionHypothesis, decide, heights_named, locate, readings
 from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, map_photographs, read_model
@@ -90,6 +93,12 @@ class SfmPreparation:
         by_name = {photo.name: photo for photo in usable}
         done = [(model, None if where is None else _placed(where, self.settings.crs)) for model, where, _ in placed]
         stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources))
+        first, where, _ = placed[0]
+        points, listed = (
+            where if isinstance(where, ControlResiduals) else None,
+            site if isinstance(site, GroundControl) else None,
+        )
+        write_tables(self.scene, first, points, listed)
         names = [set(centres_of(model)) for model, _, _ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
@@ -152,9 +161,10 @@ class SfmPreparation:
 
     def _site(self, positions: Positions) -> GroundControl | list[PositionHypothesis]:
         """Ground control points on their map; else what the positions may mean, nothing where there are none."""
-        if self.settings.gcp is not None:
+        given = self.settings
+        if given.gcp is not None:
             sizes = {photo.name: photo.size for photo in positions.photos}
-            return read_ground(self.settings.gcp, self.settings.crs, sizes, self.settings.checkpoints)
+            return read_ground(given.gcp, given.crs, sizes, given.checkpoints, given.checkpoint_names)
         return readings(positions, self.settings.crs) if self.settings.gps else []
 
     def _place(
@@ -185,7 +195,11 @@ class SfmPreparation:
         """A model on the map or level, and how heights by GPS differ from those of its cameras (`height_stretch`)."""
         where: Placement | ControlResiduals | NoSimilarity
         if isinstance(site, GroundControl):
+            site, wrong = clean_marks(model, site, self.settings)
             where = self._by_points(number, model, site, photos)
+            if isinstance(where, ControlResiduals):
+                model.transform(_sim3d(where.similarity))
+                return self._adjusted_to_points(number, model, replace(where, wrong_marks=tuple(wrong)), site, photos)
         elif isinstance(site, PositionHypothesis):
             photos = {photo.name: photo for photo in site.photos}
             where = locate(model, site, self.settings.seed)
@@ -196,8 +210,6 @@ class SfmPreparation:
             return _levelled(model, photos), None, None
         model.transform(_sim3d(where.similarity))
         _name_wrong(where)
-        if isinstance(where, ControlResiduals):
-            return model, where, None
         if where.plan:
             emit(
                 Warned(
@@ -217,6 +229,24 @@ class SfmPreparation:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
         return adjusted or model, where, stretch
 
+    def _adjusted_to_points(
+        self, number: int, model: Any, where: ControlResiduals, ground: GroundControl, photos: dict[str, Photo]
+    ) -> tuple[Any, ControlResiduals, None]:
+        """A model on the map, adjusted to the control points; says what is left out."""
+        folder = self.work / "controlled" / str(number)
+        found, where = adjust_to_points_once(model, where, ground, photos, self.settings, folder)
+        if found is None:
+            emit(
+                Warned(
+                    f"sparse/{number}: an adjustment to the control points did not fit the photographs and is left "
+                    "out: they place the model, but do not straighten it; are --gcp-sigma and --mark-sigma what they "
+                    "were surveyed and marked with?"
+                )
+            )
+        for line in warnings_of(where):
+            emit(Warned(f"sparse/{number}: {line}"))
+        return found or model, where, None
+
     def _with_exif(self, number: int, alone: Any, photos: dict[str, Photo]) -> Any:
         """A copy of the model, adjusted to the focal lengths of EXIF if there are some."""
         copy = load_engine().Reconstruction(alone)
@@ -231,7 +261,7 @@ class SfmPreparation:
         self, number: int, model: Any, ground: GroundControl, photos: dict[str, Photo]
     ) -> ControlResiduals | NoSimilarity:
         """The model by control points, unless these put it where no survey can be; says what is doubtful."""
-        where = place_by_points(model, ground, self.settings.checkpoints)
+        where = place_by_points(model, ground, self.settings.checkpoints, self.settings.checkpoint_names)
         if isinstance(where, NoSimilarity):
             return where
         if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):
@@ -280,13 +310,8 @@ def _alike(before: Sequence[Photo], photos: Sequence[Photo]) -> list[tuple[Photo
     return [(photo, now[photo.name]) for photo in before if photo.name in now]
 
 
-def _name_wrong(where: Placement | ControlResiduals) -> None:
-    """Say which positions or control points are left out."""
-    if isinstance(where, ControlResiduals):
-        for names, why in ((where.wrong, "contradict the others"), (where.unseen, "are in too few placed photographs")):
-            if names:
-                emit(Warned(f"{len(names)} ground control points {why} and are left out: {few(names)}"))
-        return
+def _name_wrong(where: Placement) -> None:
+    """Say which positions are left out."""
     wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
     far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
     if len(wrong) == 1:

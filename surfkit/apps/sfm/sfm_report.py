@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from surfkit.apps.sfm.control_report import draw_points
 from surfkit.apps.sfm.feature_cache import MIN_FEATURES
 from surfkit.apps.sfm.georeference import Placement, centres_of
 from surfkit.apps.sfm.ground_control import ControlResiduals
@@ -99,7 +100,8 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
 
 
 def draw(path: Path, model: Any, placement: Placement | ControlResiduals | None) -> None:
-    """A picture of cameras and points from above; of positions too, with a line to the camera of each."""
+    """A picture of cameras and points from above; of positions too, with a line to the camera of each, or
+    of control points with their residuals."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
@@ -121,6 +123,8 @@ def draw(path: Path, model: Any, placement: Placement | ControlResiduals | None)
         axes.plot([], [], color="tab:orange", linewidth=0.8, label="to its position")
         if not placement.fit.inside.all():
             axes.plot([], [], color="red", linewidth=0.8, label="position left out")
+    if isinstance(placement, ControlResiduals):
+        draw_points(axes, placement, float(np.ptp(near, axis=0).max()))
     axes.scatter(cameras[:, 0], cameras[:, 1], marker="^", c="tab:blue", s=24, label=f"{len(cameras)} cameras")
     axes.set(xlim=near[:, 0], ylim=near[:, 1], aspect="equal", xlabel="x", ylabel="y", title="from above")
     if placement is not None:

@@ -1,15 +1,18 @@
 """Ground control points: lists of OpenDroneMap, triangulation, similarities, checkpoints, and points that are wrong."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
+from surfkit.apps.sfm.control_list import read_ground, read_list
+from surfkit.apps.sfm.control_marks import triangulate
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.georeference import NoSimilarity
-from surfkit.apps.sfm.ground_control import doubts, place_by_points, read_ground, read_list, triangulate
+from surfkit.apps.sfm.ground_control import doubts, place_by_points
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.survey_plausibility import upside_down
 from surfkit.core.check import BadInput
@@ -196,7 +199,7 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
     assert isinstance(found, NoSimilarity) and "3 are needed besides 7 checkpoints" in found.reason
     line = [np.array([at, 2 * at, 0.1 * at]) - 3 for at in range(4)]
     points = [type(ground.points[0])(f"P{at}", tuple(xyz), pixels(xyz)) for at, xyz in enumerate(line)]
-    found = place_by_points(model(), type(ground)(points, ground.chart, np.stack(line)), 0)
+    found = place_by_points(model(), replace(ground, points=points, onto=np.stack(line)), 0)
     assert isinstance(found, NoSimilarity) and "line" in found.reason
 
 
