@@ -7,7 +7,7 @@ coordinate of another one; calibrations do not depend on it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -121,17 +121,12 @@ def _usable(model: SparseModel) -> SparseModel:
     size = float(np.median(np.linalg.norm(model.xyz - centre, axis=1))) or 1.0 if len(model.xyz) else 1.0
     poses = model.poses.copy()
     poses[:, :, 3] = (poses[:, :, 3] + poses[:, :, :3] @ centre) / size
-    moved = SparseModel(
-        model.cameras, model.names, model.camera_of, poses, (model.xyz - centre) / size, model.photo, model.point, model.xy
-    )  # fmt: skip
+    moved = replace(model, poses=poses, xyz=(model.xyz - centre) / size)
     weights = np.linalg.eigvalsh(_points(moved, _jacobians(moved)[0]))
     good = np.flatnonzero(weights[:, 0] > MIN_CONDITION * weights[:, 2])
     kept = np.isin(moved.point, good) & np.isfinite(moved.residuals).all(1)
-    named = SparseModel(
-        moved.cameras, moved.names, moved.camera_of, moved.poses, moved.xyz, moved.photo[kept], moved.point[kept],
-        moved.xy[kept],
-    )  # fmt: skip
-    return named.part(np.unique(named.photo))
+    seen = replace(moved, photo=moved.photo[kept], point=moved.point[kept], xy=moved.xy[kept])
+    return seen.part(np.unique(seen.photo))
 
 
 def _jacobians(model: SparseModel) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:

@@ -52,16 +52,16 @@ def styled() -> Any:
 def finished(canvas: Drawing, title: str, share: float = 1.0, note: str = "", photographic: bool = False) -> Figure:
     """A drawing as a figure of the document: PNG of 256 colours, or JPEG where it shows photographs or shading."""
     raw = io.BytesIO()
-    canvas.savefig(raw, format="png", dpi=DPI)
+    canvas.savefig(raw, format="png", dpi=DPI, bbox_inches="tight", pad_inches=0.02)
     image = Image.open(raw).convert("RGB")
     target = io.BytesIO()
     if photographic:
         image.save(target, "JPEG", quality=JPEG_QUALITY)
     else:
-        image.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-            target, "PNG", optimize=True
-        )
-    return Figure(title, target.getvalue(), image.size, share, note)
+        few = image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        few.save(target, "PNG", optimize=True)
+    cut = image.width / DPI * 25.4 / PRINT_WIDTH_MM  # labels keep their size where empty margins are cut off
+    return Figure(title, target.getvalue(), image.size, min(share, cut), note)
 
 
 def as_map(axes: Axes, bounds: tuple[float, float, float, float], unit: str, georeferenced: bool) -> None:
@@ -110,7 +110,9 @@ def histogram(values: np.ndarray, bins: Any, title: str, across: str, up: str, s
     """A histogram of (N,) values over bins; what lies beyond counts in the outer ones."""
     with styled():
         canvas, axes = drawing(share, 0.62)
-        edges = np.asarray(bins, np.float64)
+        edges = np.histogram_bin_edges(values, bins)
         axes.hist(np.clip(values, edges[0], edges[-1]), edges, color="#4c7fb5", edgecolor="white", linewidth=0.3)
         axes.set(xlabel=across, ylabel=up, xlim=(edges[0], edges[-1]))
+        if np.issubdtype(np.asarray(values).dtype, np.integer):
+            axes.locator_params(axis="x", integer=True)
         return finished(canvas, title, share)

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
-from surfkit.apps.quality.document import PRINT_WIDTH_MM, Document, Element, Figure, Paragraph, Row, Section, Table
+from surfkit.apps.quality.document import PRINT_WIDTH_MM, Document, Element, Figure, Paragraph, Section, Table
 from surfkit.core.check import printable
 from surfkit.core.optional import needed
 
@@ -163,11 +163,10 @@ def _table(table: Table) -> list[Any]:
         repeatRows=int(bool(table.head)),
         hAlign="LEFT",
     )
-    shown.setStyle([
-        ("LINEBELOW", (0, 0), (-1, -1), 0.4, "#dde2e7"), *([("LINEBELOW", (0, 0), (-1, 0), 0.8, FAINT)] * bool(head[0])),
-        ("TOPPADDING", (0, 0), (-1, -1), 1.2), ("BOTTOMPADDING", (0, 0), (-1, -1), 1.6),
-        ("LEFTPADDING", (0, 0), (-1, -1), 0), ("RIGHTPADDING", (0, 0), (-1, -1), 5), ("VALIGN", (0, 0), (-1, -1), "TOP"),
-    ])  # fmt: skip
+    lines = [("LINEBELOW", (0, 0), (-1, -1), 0.4, "#dde2e7")]
+    if table.head:
+        lines.append(("LINEBELOW", (0, 0), (-1, 0), 0.8, FAINT))
+    shown.setStyle([*lines, *_padding(right=5, top=1.2, bottom=1.6)])
     title = _text(table.title, _style(9, bold=True, spaceBefore=6, spaceAfter=2, keepWithNext=1))
     note = [_text(table.note, _style(7, FAINT, spaceBefore=2, spaceAfter=3))] if table.note else []
     return [title, shown, *note]
@@ -200,8 +199,12 @@ def _row(figures: tuple[Figure, ...], share: float) -> Any:
         note = [_text(figure.note, _style(7, FAINT, spaceBefore=1))] if figure.note else []
         cells.append([_text(figure.title, _style(9, bold=True, spaceAfter=2)), picture, *note])
     shown = PdfTable([cells], colWidths=[width] * len(figures), hAlign="LEFT", spaceBefore=4, spaceAfter=4)
-    shown.setStyle([
-        ("LEFTPADDING", (0, 0), (-1, -1), 0), ("RIGHTPADDING", (0, 0), (-1, -1), gap), ("VALIGN", (0, 0), (-1, -1), "TOP"),
-        ("TOPPADDING", (0, 0), (-1, -1), 0), ("BOTTOMPADDING", (0, 0), (-1, -1), 0),
-    ])  # fmt: skip
+    shown.setStyle(_padding(right=gap))
     return shown
+
+
+def _padding(right: float = 0, top: float = 0, bottom: float = 0) -> list[Any]:
+    """Of all cells of a table, points; they have none to the left, and begin at the top."""
+    sides = {"LEFT": 0, "RIGHT": right, "TOP": top, "BOTTOM": bottom}
+    whole = ((0, 0), (-1, -1))
+    return [("VALIGN", *whole, "TOP"), *((f"{side}PADDING", *whole, value) for side, value in sides.items())]

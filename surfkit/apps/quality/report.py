@@ -20,8 +20,8 @@ from surfkit.apps.sfm.settings import REPORT_FILE
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 
-DEFAULT_HTML = "quality_report.html"
-"""Name of the file in the folder; that of the PDF has its own ending."""
+DEFAULT_HTML, DEFAULT_PDF = "quality_report.html", "quality_report.pdf"
+"""Names of the files in the folder."""
 
 
 def document_of(survey: Survey) -> Document:
@@ -72,6 +72,3 @@ def write_quality(target: Path, out: Path, with_pdf: bool) -> list[Path]:
         with replacing(path) as file:
             file.write(content)
     return list(files)
-
-
-__all__ = ["DEFAULT_HTML", "DELIVERY_RECORD", "document_of", "write_quality"]

@@ -10,7 +10,7 @@ from scipy.ndimage import binary_fill_holes
 from surfkit.apps.maps.hillshade import hillshade
 from surfkit.apps.quality.document import Element, Figure, Paragraph, Section, Table, facts
 from surfkit.apps.quality.figures import as_map, bounds_about, drawing, finished, styled
-from surfkit.apps.quality.overlap import Ground, overlap, read_raster
+from surfkit.apps.quality.overlap import Ground, read_raster
 from surfkit.apps.quality.sections.words import area, fixed, share
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import mapping, number, value_at
@@ -176,7 +176,7 @@ def _surface_figures(survey: Survey, heights: np.ndarray, bounds: tuple[float, f
     shaded = np.where(known[..., None], tint * (0.35 + 0.65 * light[..., None] / max(np.median(light), 0.5)), 1.0)
     note = "Colours by height, shaded by light from the north-west."
     coloured = drawn_map(survey, shaded.clip(0, 1), bounds, "Surface model", 0.9, values, note)
-    return [facts("Surface model", [row for row in rows if row[1]]), coloured]
+    return [facts("Heights", [row for row in rows if row[1]]), coloured]
 
 
 def _precision(survey: Survey, bands: np.ndarray, bounds: tuple[float, float, float, float]) -> list[Element]:

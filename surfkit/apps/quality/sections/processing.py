@@ -64,7 +64,8 @@ def processing(survey: Survey) -> Section:
         ("Reading of the data set", mapping(survey.record, "data")),
     ):
         if settings:
-            elements.append(facts(title, [(name, in_words(value)) for name, value in flat(settings).items()]))
+            rows = [(name, in_words(value)) for name, value in flat(settings).items() if value is not None]
+            elements.append(facts(title, rows, "Those that are given, or have a default."))
     notes = [*texts(survey.record, "notes"), *(f"left out: {name}: {why}" for name, why in _left_out(survey).items())]
     elements += [Paragraph(f"Note: {note}") for note in notes]
     return Section("Processing", tuple(elements))

@@ -54,7 +54,13 @@ def tie_points(survey: Survey) -> Section:
         lengths, np.arange(1.5, MAX_TRACK + 1), "Photographs of a tie point", f"photographs ({MAX_TRACK}: or more)",
         "tie points",
     )  # fmt: skip
-    sizes = histogram(errors, np.linspace(0, most, ERROR_BINS), "Reprojection errors", "error, px", "observations")
+    sizes = histogram(
+        errors,
+        np.linspace(0, most, ERROR_BINS),
+        "Reprojection errors",
+        f"error, px ({most:.1f}: or more)",
+        "observations",
+    )
     elements: list[Element] = [facts("All tie points", rows), table, Row((tracks, sizes))]
     if (place := residual_figure(model)) is not None:
         elements.append(place)
@@ -110,10 +116,10 @@ def residual_figure(model: SparseModel) -> Figure | None:
         arrows.set_clim(0, float(lengths[known].max()))
         axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")
         canvas.colorbar(arrows, ax=axes, label="mean residual, px", shrink=0.8)
-        of = f" of the {int((model.camera_of == number).sum())} photographs of camera {list(model.cameras).index(number) + 1}"
+        of = f"camera {list(model.cameras).index(number) + 1} ({int((model.camera_of == number).sum())} photographs)"
         note = (
-            f"Observed less projected, mean of each cell{of}, {times:g} times as long as they are. A pattern, such as "
-            "arrows to or from the middle, is an error of the lens model."
+            f"Observed less projected, mean of each cell, of {of}; {times:g} times as long as they are. A pattern, "
+            "such as arrows to or from the middle, is an error of the lens model."
         )
         return finished(canvas, "Residuals by place in the photograph", 0.75, note)
 
@@ -132,7 +138,7 @@ def not_used(survey: Survey) -> list[Element]:
 
 
 def appendix(survey: Survey) -> Section | None:
-    """Tie points, errors and residuals of each photograph; None of more than `MAX_LISTED`, or where nothing is known."""
+    """Tie points, errors and residuals of each photograph; None of more than `MAX_LISTED`, or without tie points."""
     model = survey.tie_points
     if model is None or len(model.names) > MAX_LISTED:
         return None

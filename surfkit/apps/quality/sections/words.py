@@ -22,7 +22,9 @@ def length(value: float | None, unit: str) -> str:
 
 def fixed(value: float | None, digits: int) -> str:
     """A number with so many digits after the point; a dash for none."""
-    return NO_VALUE if value is None or not np.isfinite(value) else f"{value:,.{digits}f}"
+    if value is None or not np.isfinite(value):
+        return NO_VALUE
+    return f"{round(value, digits) + 0.0:,.{digits}f}"  # + 0.0: no -0.000
 
 
 def area(square_units: float, metres: float | None) -> str:
