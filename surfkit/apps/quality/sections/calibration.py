@@ -69,7 +69,8 @@ def _camera(
         in_px = index in (*camera.focal_length_idxs(), *camera.principal_point_idxs())
         sigma = "not adjusted" if index in camera.principal_point_idxs() else fixed(None, 0)
         if found is not None and index in places:
-            sigma = f"{found.deviations[places[index]]:.3g}"
+            deviation = found.deviations[places[index]]
+            sigma = f"{deviation:.3f}" if in_px else f"{deviation:.1e}"
         shown.append((name, f"{value:.3f}" if in_px else f"{value:.3e}", "px" if in_px else "", sigma))
     elements.append(
         Table("Calibration", ("parameter", "value", "unit", "standard deviation"), tuple(shown), _note(found))

@@ -9,6 +9,8 @@ from surfkit.apps.quality.sections.words import fixed
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import as_bytes, as_duration, flat, in_words, mapping, number, texts
 
+HIDDEN = {"path", "priors"}
+"""Settings that are places on this machine, no business of a client's."""
 MAX_ROWS = 200
 """Of a table of held-out photographs."""
 
@@ -64,7 +66,11 @@ def processing(survey: Survey) -> Section:
         ("Reading of the data set", mapping(survey.record, "data")),
     ):
         if settings:
-            rows = [(name, in_words(value)) for name, value in flat(settings).items() if value is not None]
+            rows = [
+                (name, in_words(value))
+                for name, value in flat(settings).items()
+                if value is not None and name not in HIDDEN
+            ]
             elements.append(facts(title, rows, "Those that are given, or have a default."))
     notes = [*texts(survey.record, "notes"), *(f"left out: {name}: {why}" for name, why in _left_out(survey).items())]
     elements += [Paragraph(f"Note: {note}") for note in notes]
