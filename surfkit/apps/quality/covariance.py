@@ -17,6 +17,10 @@ from surfkit.apps.quality.sparse_model import SparseModel, projected, with_param
 
 MAX_PHOTOS, MAX_OBSERVATIONS = 300, 300_000
 """Of a block whose normal matrix is formed: about 20 seconds and 1 GB."""
+DATUM = 7
+"""Unknowns of a block that no tie point determines: position, rotation, scale."""
+MIN_PIVOT = 1e-13
+"""Least square of a pivot of a normal matrix with 1 on its diagonal, below which it is singular."""
 STEP = 1e-6
 """Of differences of projections, as a share of depths and parameters."""
 MIN_CONDITION = 1e-12
@@ -69,14 +73,12 @@ def calibration_precision(model: SparseModel, number: int) -> CalibrationPrecisi
     part = model.part(chosen)
     if (every := -(-len(part.xy) // MAX_OBSERVATIONS)) > 1:
         part = model.part(chosen, every)
-    found = covariances(part)
-    if found is None or number not in found[0]:
+    sigma, found = unit_weight(model), cofactors(part)
+    if sigma is None or found is None or number not in found:
         return None
-    by_camera, sigma = found
     is_whole = len(chosen) == len(model.names) and every == 1
-    return CalibrationPrecision(
-        estimated(part.cameras[number]), by_camera[number], sigma, len(chosen), len(part.xy), is_whole
-    )
+    covariance = sigma**2 * found[number]
+    return CalibrationPrecision(estimated(part.cameras[number]), covariance, sigma, len(chosen), len(part.xy), is_whole)
 
 
 def estimated(camera: object) -> tuple[int, ...]:
@@ -84,18 +86,19 @@ def estimated(camera: object) -> tuple[int, ...]:
     return (*camera.focal_length_idxs(), *camera.extra_params_idxs())  # type: ignore[attr-defined]
 
 
-def covariances(model: SparseModel) -> tuple[dict[int, np.ndarray], float] | None:
-    """(K, K) covariance of the calibration of each camera, and the standard deviation of unit weight in pixels; None
+def unit_weight(model: SparseModel) -> float | None:
+    """Standard deviation of one coordinate of an observation after the adjustment of a whole model, pixels; None where
+    there are no more observations than unknowns."""
+    degrees = 2 * len(model.xy) - _unknowns(model)[1] - 3 * len(model.xyz) + DATUM
+    return float(np.sqrt(np.nansum(model.residuals**2) / degrees)) if degrees > 0 else None
+
+
+def cofactors(model: SparseModel) -> dict[int, np.ndarray] | None:
+    """(K, K) covariance of the calibration of each camera for observations with a standard deviation of one pixel; None
     where the normal matrix has a defect beside that of the datum."""
     model = _usable(model)
-    photos, lenses = len(model.names), {}
-    unknowns = 6 * photos
-    for number, camera in model.cameras.items():
-        count = len(estimated(camera))
-        lenses[number] = np.arange(unknowns, unknowns + count)
-        unknowns += count
-    degrees = 2 * len(model.xy) - unknowns - 3 * len(model.xyz) + 7
-    if photos < 2 or degrees <= 0:
+    photos, (lenses, unknowns) = len(model.names), _unknowns(model)
+    if photos < 2 or 2 * len(model.xy) < unknowns + 3 * len(model.xyz) - DATUM:
         return None
     normal = _reduced(model, lenses, unknowns)
     scale = 1 / np.sqrt(np.diagonal(normal).clip(np.finfo(float).tiny))
@@ -108,11 +111,20 @@ def covariances(model: SparseModel) -> tuple[dict[int, np.ndarray], float] | Non
         left = cho_factor(normal[np.ix_(inner, inner)] - across.T @ cho_solve(poses, across), lower=True)
     except LinAlgError:
         return None
-    variance = float((model.residuals**2).sum() / degrees)
-    whole = cho_solve(left, np.eye(len(inner))) * np.outer(scale[inner], scale[inner]) * variance
+    if min(np.diagonal(factor).min() for factor, _ in (poses, left)) ** 2 < MIN_PIVOT:
+        return None
+    whole = cho_solve(left, np.eye(len(inner))) * np.outer(scale[inner], scale[inner])
     first = 6 * photos
-    found = {number: whole[np.ix_(at - first, at - first)] for number, at in lenses.items()}
-    return found, float(np.sqrt(variance))
+    return {number: whole[np.ix_(at - first, at - first)] for number, at in lenses.items()}
+
+
+def _unknowns(model: SparseModel) -> tuple[dict[int, np.ndarray], int]:
+    """Where the calibration of each camera lies among the unknowns, poses first, and how many these are."""
+    lenses, count = {}, 6 * len(model.names)
+    for number, camera in model.cameras.items():
+        lenses[number] = count + np.arange(len(estimated(camera)))
+        count += len(lenses[number])
+    return lenses, count
 
 
 def _usable(model: SparseModel) -> SparseModel:
