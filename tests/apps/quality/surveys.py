@@ -44,12 +44,10 @@ def prepared(folder):
     (folder / "images").mkdir()
     for name in flight.names:
         Image.fromarray(np.full((HEIGHT, WIDTH, 3), 99, np.uint8)).save(folder / "images" / name)
-    photos = [
-        replace(
-            photo, exif=replace(photo.exif, taken=f"2024:05:{2 + at // 20:02d} 12:{at:02d}:00", camera="Acme <One>")
-        )
-        for at, photo in enumerate(flight.photos(FOCAL).values())
-    ]
+    photos = []
+    for at, photo in enumerate(flight.photos(FOCAL).values()):
+        taken = f"2024:05:{2 + at // 20:02d} 12:{at:02d}:00"
+        photos.append(replace(photo, exif=replace(photo.exif, taken=taken, camera="Acme <One>")))
     write_json(folder / "prepare/photographs.json", photos)
     listed = folder / "gcp_list.txt"
     rows = [
