@@ -17,7 +17,9 @@ from surfkit.scene.scene import View
 MAX_CELLS = 250
 """Cells along the longer side of the overlap map."""
 SPARSE_CELLS = 120
-"""The same where heights are those of the sparse points only."""
+"""The same where heights are those of the sparse points only; fewer where cells would have too few of these."""
+CELL_POINTS = 4
+"""Sparse points of a cell, on average, at least."""
 REACH_CELLS = 2.5
 """How far from a sparse point a cell may lie to have its height."""
 SPARSE_PERCENTILES = (1, 99)
@@ -80,8 +82,9 @@ def ground_of(survey: Survey) -> Ground | None:
 def ground_of_points(placed: np.ndarray) -> Ground:
     """Median heights of (P, 3) sparse points in cells, and in cells next to these that of the nearest."""
     low, high = np.percentile(placed[:, :2], SPARSE_PERCENTILES, axis=0)
-    size = max(float((high - low).max()), 1e-9) / SPARSE_CELLS
-    columns, rows = (max(1, int(np.ceil(side / size))) for side in high - low)
+    sides = np.maximum(high - low, 1e-9)
+    size = max(float(sides.max()) / SPARSE_CELLS, float(np.sqrt(CELL_POINTS * sides.prod() / len(placed))))
+    columns, rows = (max(1, int(np.ceil(side / size))) for side in sides)
     at = np.floor((placed[:, :2] - low) / size).astype(int)
     inside = ((at >= 0) & (at < (columns, rows))).all(1)
     cell = (rows - 1 - at[inside, 1]) * columns + at[inside, 0]

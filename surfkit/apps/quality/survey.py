@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,8 +71,8 @@ class Survey:
 
     @property
     def name(self) -> str:
-        """That of the folder."""
-        return self.target.resolve().name
+        """That of the folder, as it was named."""
+        return os.path.basename(os.path.abspath(self.target))
 
     @cached_property
     def views(self) -> tuple[View, ...]:

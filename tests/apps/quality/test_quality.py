@@ -157,7 +157,9 @@ def test_the_ground_of_points_has_their_median_heights():
     ground = ground_of_points(np.column_stack([xy, 3 + 0.1 * xy[:, 0]]))
     places = ground.places()
     assert np.isfinite(ground.heights).mean() > 0.9
-    assert np.nanmax(np.abs(places[..., 2] - 3 - 0.1 * places[..., 0])) < 0.1 * 3.5 * 100 / 120
+    assert np.nanmax(np.abs(places[..., 2] - 3 - 0.1 * places[..., 0])) < 0.1 * 3.5 * 3.2, (
+        "cells hold 4 points on average"
+    )
 
 
 def test_means_of_residuals_by_place_and_photograph(survey):

@@ -91,7 +91,8 @@ def positions_figure(survey: Survey, residuals: dict[str, np.ndarray], with_heig
                 canvas.colorbar(arrows, ax=axes, label="residual in z, m", shrink=0.7)
             note += f" Arrows from camera to position, in plan, {times:g} times as long as they are."
         as_map(axes, bounds, survey.unit, survey.scene.frame.crs is not None)
-        return finished(canvas, "Camera positions and their residuals", 0.82, note)
+        title = "Camera positions and their residuals" if names else "Cameras from above"
+        return finished(canvas, title, 0.82, note)
 
 
 def exaggeration(plan: np.ndarray, bounds: tuple[float, float, float, float]) -> float:

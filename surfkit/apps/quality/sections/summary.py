@@ -23,6 +23,8 @@ MAX_THIN_SHARE = 0.2
 """Of the area that fewer than three photographs see, above which a warning is given."""
 MAX_CHECK_GSD = 3.0
 """Ground sampling distances that check points may be off in one axis (RMS): 1 to 3 is what surveyors expect."""
+ASPRS_CHECK_POINTS = 30
+"""ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2 (2023)."""
 MAX_HEIGHT_SAMPLES = 20_000
 """Sparse points that tell how far away the ground is."""
 
@@ -69,7 +71,7 @@ def summary(found: Findings, processed: str) -> Section:
     orthophoto = picture(survey, "orthophoto.tif", "Orthophoto", 0.5) or sparse_picture(survey, 0.5)
     relief = picture(survey, "hillshade.tif", "Hillshade", 0.5)
     if shown := tuple(figure for figure in (orthophoto, relief) if figure is not None):
-        elements.append(Row(shown))
+        elements.append(Row(shown) if len(shown) > 1 else shown[0])
     if not survey.maps:
         elements.append(Paragraph(f"There are no maps. {NEEDS_MAPS}", "missing"))
     elements.append(facts("Survey", rows))
@@ -138,7 +140,9 @@ def meaning(survey: Survey, distance: float | None) -> str:
         plan = float(np.hypot(number(checks, "e") or 0, number(checks, "n") or 0))
         said.append(
             f"Check points, which took no part in the adjustment, are off by {length(plan, 'm')} in plan and "
-            f"{length(number(checks, 'u'), 'm')} in height (RMS): so exact are coordinates taken from the maps."
+            f"{length(number(checks, 'u'), 'm')} in height (RMS): so exact are coordinates taken from the maps. "
+            f"That is by {len(texts(survey.ground_control, 'checkpoints'))} of them; the ASPRS standard asks for "
+            f"{ASPRS_CHECK_POINTS} or more."
         )
     elif survey.ground_control:
         said.append(
