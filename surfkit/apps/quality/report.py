@@ -7,14 +7,14 @@ from pathlib import Path
 
 from surfkit.apps.quality.document import Document, Section
 from surfkit.apps.quality.html_writer import html
-from surfkit.apps.quality.overlap import ground_of, overlap
 from surfkit.apps.quality.pdf_writer import pdf
+from surfkit.apps.quality.photo_overlap import ground_of, overlap
 from surfkit.apps.quality.sections.calibration import calibration
 from surfkit.apps.quality.sections.maps_section import overlap_section, surface
 from surfkit.apps.quality.sections.processing import held_out, processing
 from surfkit.apps.quality.sections.residuals import control, positions
 from surfkit.apps.quality.sections.summary import Findings, summary
-from surfkit.apps.quality.sections.tie_points import appendix, tie_points
+from surfkit.apps.quality.sections.tie_point_section import appendix, tie_points
 from surfkit.apps.quality.survey import Survey, open_survey
 from surfkit.apps.sfm.settings import REPORT_FILE
 from surfkit.core.files import replacing

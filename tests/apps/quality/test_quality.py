@@ -16,14 +16,14 @@ from surveys import CONTROL, OFFSET, prepared
 from surfkit.apps.quality import report
 from surfkit.apps.quality.document import Figure, Paragraph, Row, Table
 from surfkit.apps.quality.figures import round_length
-from surfkit.apps.quality.overlap import Ground, ground_of, ground_of_points, overlap
 from surfkit.apps.quality.pdf_writer import pdf
+from surfkit.apps.quality.photo_overlap import Ground, ground_of, ground_of_points, overlap
 from surfkit.apps.quality.report import document_of
 from surfkit.apps.quality.sections.calibration import radial_distortion
 from surfkit.apps.quality.sections.maps_section import covered, surface
 from surfkit.apps.quality.sections.residuals import control
 from surfkit.apps.quality.sections.summary import ground_sampling_distance
-from surfkit.apps.quality.sections.tie_points import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
+from surfkit.apps.quality.sections.tie_point_section import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
 from surfkit.apps.quality.sparse_model import SparseModel
 from surfkit.apps.quality.survey import open_survey
 from surfkit.apps.sfm.engine import load_engine

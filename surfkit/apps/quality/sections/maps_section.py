@@ -10,7 +10,7 @@ from scipy.ndimage import binary_fill_holes
 from surfkit.apps.maps.hillshade import hillshade
 from surfkit.apps.quality.document import Element, Figure, Paragraph, Section, Table, facts
 from surfkit.apps.quality.figures import as_map, bounds_about, drawing, finished, styled
-from surfkit.apps.quality.overlap import Ground, read_raster
+from surfkit.apps.quality.photo_overlap import Ground, read_raster
 from surfkit.apps.quality.sections.words import area, fixed, share
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import mapping, number, value_at

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.apps.quality.document import Element, Paragraph, Row, Section, Table, facts
-from surfkit.apps.quality.overlap import Ground
+from surfkit.apps.quality.photo_overlap import Ground
 from surfkit.apps.quality.sections.maps_section import NEEDS_MAPS, covered, picture, sparse_picture
 from surfkit.apps.quality.sections.residuals import accuracy_rows
 from surfkit.apps.quality.sections.words import days, fixed, length, share
