@@ -111,7 +111,9 @@ def histogram(values: np.ndarray, bins: Any, title: str, across: str, up: str, s
     with styled():
         canvas, axes = drawing(share, 0.62)
         edges = np.histogram_bin_edges(values, bins)
-        axes.hist(np.clip(values, edges[0], edges[-1]), edges, color="#4c7fb5", edgecolor="white", linewidth=0.3)
+        axes.hist(
+            np.clip(values, edges[0], edges[-1]), edges.tolist(), color="#4c7fb5", edgecolor="white", linewidth=0.3
+        )
         axes.set(xlabel=across, ylabel=up, xlim=(edges[0], edges[-1]))
         if np.issubdtype(np.asarray(values).dtype, np.integer):
             axes.locator_params(axis="x", integer=True)
