@@ -75,6 +75,10 @@ def surfkit_commands():
         "report": LazyCommand(
             "surfkit.apps.report.command", "Write a report of runs or of an ablation table as one HTML file."
         ),
+        "quality": LazyCommand(
+            "surfkit.apps.quality.command",
+            "Write the quality report of a survey, as HTML and PDF: accuracy, overlap, calibration, tie points.",
+        ),
         "import": LazyCommand(
             "surfkit.apps.import_splats",
             "Take splats from a file of any program, to measure, mesh or export them like those of a run.",

@@ -13,7 +13,8 @@ from surfkit.core.memory import is_out_of_memory
 EXTRAS = {
     "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "kornia": "features", "laspy": "maps",
     "lazrs": "maps", "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pxr": "usd", "pyogrio": "maps",
-    "rasterio": "maps", "ray": "ray", "shapely": "maps", "submitit": "slurm", "tensorboard": "tensorboard",
+    "rasterio": "maps", "ray": "ray", "reportlab": "report", "shapely": "maps", "submitit": "slurm",
+    "tensorboard": "tensorboard",
     "transformers": "depth", "trimesh": "mesh", "viser": "view",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""

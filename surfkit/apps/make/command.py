@@ -28,9 +28,9 @@ from surfkit.raster.select import Device
 
 @dataclass(frozen=True)
 class MakeCommand:
-    """Go the whole way: from photographs, or a data set, to textured mesh, maps, splats and report in one folder.
+    """Go the whole way: from photographs, or a data set, to textured mesh, maps, splats and reports in one folder.
 
-    It finds the cameras where there are none, trains, makes mesh, texture, maps and the report, each in a folder of its
+    It finds the cameras where there are none, trains, makes mesh, texture, maps and reports, each in a folder of its
     own in DELIVERY. It asks nothing: DELIVERY/make.json and the output say what was decided. When it is interrupted,
     the same command goes on where it stopped; what is finished is not done again.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from surfkit.apps.maps.make_maps import USUAL_PRODUCTS, Product
 from surfkit.apps.maps.make_maps import MapSettings as Maps
 from surfkit.apps.maps.map_grid import map_crs
+from surfkit.apps.quality.pdf_writer import require_reportlab
 from surfkit.apps.texture.texture_mesh import TextureSettings, refuse_unplaced
 from surfkit.core.check import BadInput
 from surfkit.mesh.simplify import require_simplification
@@ -23,11 +24,13 @@ class Wanted:
         texture: How the mesh is textured; None where it is not.
         maps: Which maps are drawn; None where none are.
         left_out: Reasons, by what is left out.
+        pdf: Whether the quality report is written as PDF too.
     """
 
     texture: TextureSettings | None
     maps: Maps | None
     left_out: dict[str, str]
+    pdf: bool = True
 
     def on(self, frame: Frame) -> Wanted:
         """What can be made of a scene in this frame: its coordinate reference system may have no place for some."""
@@ -44,7 +47,7 @@ class Wanted:
             except BadInput as error:
                 left_out["maps"] = str(error)
                 maps = None
-        return Wanted(texture, maps, left_out)
+        return Wanted(texture, maps, left_out, self.pdf)
 
 
 def wanted() -> Wanted:
@@ -55,11 +58,16 @@ def wanted() -> Wanted:
         require_simplification("surfkit texture")
     except BadInput as error:
         left_out["texture"], texture = f"{error}; {INSTALL_LATER}", None
+    pdf = True
+    try:
+        require_reportlab()
+    except BadInput as error:
+        left_out["quality report as PDF"], pdf = f"{error}; {INSTALL_LATER}", False
     try:
         Maps(products=()).refuse_missing()
     except BadInput as error:
         left_out["maps"] = f"{error}; {INSTALL_LATER}"
-        return Wanted(texture, None, left_out)
+        return Wanted(texture, None, left_out, pdf)
     products: list[Product] = []
     for name in USUAL_PRODUCTS:
         try:
@@ -68,4 +76,4 @@ def wanted() -> Wanted:
             left_out[name] = f"{error}; {INSTALL_LATER}"
         else:
             products.append(name)
-    return Wanted(texture, Maps(products=tuple(products)), left_out)
+    return Wanted(texture, Maps(products=tuple(products)), left_out, pdf)

@@ -15,6 +15,7 @@ from surfkit.apps.make.record import MAKE_RECORD, Delivery
 from surfkit.apps.maps.command import MapsCommand
 from surfkit.apps.maps.owned_files import MAPS_RECORD
 from surfkit.apps.prepare_photos import PreparePhotosCommand
+from surfkit.apps.quality.report import DEFAULT_HTML, DEFAULT_PDF, write_quality
 from surfkit.apps.report.report_page import DEFAULT_FILE, ReportOptions, write_report
 from surfkit.apps.run_summary import show
 from surfkit.apps.texture.command import TextureCommand
@@ -36,6 +37,8 @@ from surfkit.train.progress_bars import bars
 SCENE, RUN, TEXTURE, MAPS = "scene", "run", "texture", "maps"
 """Folders in a delivery."""
 OPENED = {
+    "quality report": DEFAULT_HTML,
+    "quality report (PDF)": DEFAULT_PDF,
     "report": DEFAULT_FILE,
     "textured mesh (GLB)": f"{TEXTURE}/textured.glb",
     "textured mesh (OBJ)": f"{TEXTURE}/textured.obj",
@@ -105,6 +108,8 @@ class Way:
             work = self._files_of(maps.run, self.out / MAPS, MAPS_RECORD)
             self._once("maps", self.out / MAPS, key_of(mesh, wanted.maps), work)
         self._once("report", self.out, key_of(mesh, self._text("metrics.json")), self._report)
+        key = key_of(mesh, self._text("metrics.json"), self._maps_text(), wanted.pdf)
+        self._once("quality", self.out, key, lambda: write_quality(self.out, self.out / DEFAULT_HTML, wanted.pdf))
         self._finish()
 
     @property
@@ -117,7 +122,7 @@ class Way:
     def _names(self) -> list[str]:
         """The steps of this delivery."""
         without = {*self.delivery.record.left_out, *(["cameras"] if self.photos is None else [])}
-        return [name for name in ("cameras", "surface", "texture", "maps", "report") if name not in without]
+        return [name for name in ("cameras", "surface", "texture", "maps", "report", "quality") if name not in without]
 
     def _tell_left_out(self, told: dict[str, str]) -> dict[str, str]:
         """Say what is left out and has not been told; all that is told then."""
@@ -188,6 +193,11 @@ class Way:
         """A digest of which mesh the run has now: it may be made again with other settings."""
         facts = (self.out / RUN / "mesh.ply").stat()
         return key_of(self._text("mesh.json"), facts.st_size, facts.st_mtime_ns)
+
+    def _maps_text(self) -> str:
+        """The facts of the maps, which the quality report shows; empty where there are none."""
+        path = self.out / MAPS / MAPS_RECORD
+        return path.read_text(encoding="utf-8") if path.is_file() else ""
 
     def _text(self, name: str) -> str:
         try:

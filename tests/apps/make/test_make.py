@@ -18,7 +18,7 @@ from surfkit.runs import pipeline
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 QUICK = ("--quality", "draft", "--steps", "4", "--device", "cpu")
-STEPS = ("surface", "texture", "maps", "report")
+STEPS = ("surface", "texture", "maps", "report", "quality")
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +61,7 @@ def calls(monkeypatch):
     """Names of the steps that work, in a list that grows."""
     seen = []
     places = {"surface": (pipeline, "optimise"), "texture": (texture, "make_texture")}
-    places |= {"maps": (maps, "make_maps"), "report": (way, "write_report")}
+    places |= {"maps": (maps, "make_maps"), "report": (way, "write_report"), "quality": (way, "write_quality")}
     for step, (module, name) in places.items():
         plain = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, plain=plain, step=step, **k: seen.append(step) or plain(*a, **k))
@@ -90,7 +90,8 @@ def test_interrupted_after_each_step_it_goes_on_and_repeats_none(farm, unmeasure
     assert seen == list(STEPS) and "maps: finished" in said.err and "delivered" in said.out
     told, out = record(farm), farm.parent / "delivery"
     assert told["decisions"]["photographs"] == 8 and told["decisions"]["recipe"] == "surface-short"
-    opened = {"report", "textured mesh (GLB)", "mesh", "surface model", "contour lines", "point cloud", "splats"}
+    opened = {"textured mesh (GLB)", "mesh", "surface model", "contour lines", "point cloud", "splats"}
+    opened |= {"quality report", "report"}
     assert opened <= set(told["files"]) and all((out / path).exists() for path in told["files"].values())
     assert told["left_out"] == {} and json.loads((out / "run/metrics.json").read_text())["steps"] == 4
 
@@ -132,7 +133,7 @@ def test_what_is_not_installed_is_told_first_and_added_later(farm, monkeypatch, 
     out = farm.parent / "delivery"
     assert (out / "maps/dsm.tif").exists() and not (out / "maps/points.copc.laz").exists()
     seen = calls(monkeypatch)
-    assert make(farm) == 0 and seen == ["texture", "maps"] and record(farm)["left_out"] == {}
+    assert make(farm) == 0 and seen == ["texture", "maps", "quality"] and record(farm)["left_out"] == {}
 
 
 @needs_native
@@ -151,7 +152,7 @@ def test_a_step_that_fails_leaves_the_others_and_says_how_to_go_on(farm, unmeasu
     steps = record(farm)["steps"]
     assert steps["texture"]["complete"] and not steps["maps"]["complete"] and "report" not in steps
     seen = calls(monkeypatch)
-    assert make(farm) == 0 and seen == ["maps", "report"]
+    assert make(farm) == 0 and seen == ["maps", "report", "quality"]
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(farm, unmeasured, capsys):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flight import ALTITUDE, FOCAL, fly, reconstructed
 
 from surfkit.apps.sfm.bundle_adjustment import adjust
 from surfkit.apps.sfm.engine import load_engine
@@ -14,8 +15,6 @@ from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.sfm_pipeline import SfmPreparation
 from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.earth import from_utm
-
-from .flight import ALTITUDE, FOCAL, fly, reconstructed
 
 CORNER = np.array([512_000.0, 5_800_000.0, 90.0])
 

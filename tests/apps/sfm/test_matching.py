@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from flight import HEIGHT, NOISE_PX, WIDTH, fly
 
 from surfkit.apps.sfm import colmap_database as matching
 from surfkit.apps.sfm.engine import load_engine
@@ -14,8 +15,6 @@ from surfkit.apps.sfm.mutual import Mutual
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.similarity import umeyama
 from surfkit.core.codec import dump
-
-from .flight import HEIGHT, NOISE_PX, WIDTH, fly
 
 CPU = torch.device("cpu")
 

@@ -1,0 +1,1 @@
+"""The sections of a quality report, one file for each subject."""
