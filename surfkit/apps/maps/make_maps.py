@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,16 +17,17 @@ from surfkit.apps.maps.difference import Difference, draw_difference, write_diff
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.hillshade import draw_hillshade
 from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
-from surfkit.apps.maps.orthophoto import OrthophotoColors
+from surfkit.apps.maps.orthophoto import mosaic
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
 from surfkit.apps.maps.polygon_file import AreaPolygon, read_polygons
+from surfkit.apps.maps.rasters import Raster
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
 from surfkit.apps.maps.volume_base import BaseKind
 from surfkit.apps.maps.volumes import VolumeSettings, measure_volumes, volumes_record, write_volumes
 from surfkit.apps.texture.resolution import ground_sampling_distance
-from surfkit.apps.texture.texture_cache import TextureCache, identity, seen
-from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
+from surfkit.apps.texture.texture_cache import identity, seen
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
@@ -33,7 +35,6 @@ from surfkit.core.optional import needed
 from surfkit.core.stages import key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
-from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
@@ -90,8 +91,8 @@ class MapSettings:
     and the place where closed ones begin."""
 
     colors: Literal["photographs", "mesh"] = "mesh"
-    """Of the orthophoto: those of the photographs, one for each place, or those of the vertices of the mesh, which are
-    means of photographs or of renders."""
+    """Of the orthophoto: those of the photographs, a mosaic of large parts of them, or those of the vertices of the
+    mesh, which are means of photographs or of renders."""
 
     memory: str = "auto"
     """Memory for photographs, such as 4GB, with --colors photographs; auto is half of the free memory."""
@@ -149,7 +150,8 @@ class MapSettings:
             with needed("pyogrio", "--volume"):
                 __import__("pyogrio")
         if self.colors == "photographs":
-            require_simplification("simplifying a mesh")
+            with needed("cv2", "--colors photographs"):
+                __import__("cv2")
 
 
 def make_maps(
@@ -184,8 +186,9 @@ def make_maps(
         refuse_apart(other, grid)
     polygons = [] if settings.volume is None else read_polygons(settings.volume, grid, frame.crs)
     done, unit = drawable(surface, settings), unit_of(frame)
-    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()),
-             *(VOLUME_FILES if polygons else ()))]  # fmt: skip
+    from_photographs = "orthophoto" in done and settings.colors == "photographs"
+    files = [PRODUCT_FILES[name] for name in (*done, *["sources"] * from_photographs,
+             *(COMPARISON_FILES if other is not None else ()), *(VOLUME_FILES if polygons else ()))]  # fmt: skip
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
@@ -194,10 +197,7 @@ def make_maps(
     with workshop(out, (*files, MAPS_RECORD), key) as folder:
         replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
         sheet = GeoTiffSettings(grid, crs, folder, out, needs_double(surface, grid), replaced)
-        drawn = SurfaceModelStats(**sheet.once(
-            [PRODUCT_FILES[name] for name in ("dsm", "orthophoto") if name in done],
-            lambda: asdict(draw(subject, settings, sheet, PRODUCT_FILES["orthophoto"] in files)),
-        ))  # fmt: skip
+        drawn, photographs = draw(subject, settings, sheet, "orthophoto" in done)
         record = {
             "mesh": str(surface.path),
             "crs": frame.crs,
@@ -212,8 +212,8 @@ def make_maps(
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
             "heights": [drawn.lowest, drawn.highest],
         }
-        if "orthophoto" in done and settings.colors == "photographs":
-            record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
+        if photographs:
+            record["orthophoto"] = photographs
         record |= draw_products(subject, settings, sheet, drawn, done)
         if other is not None:
             record["difference"] = subtract(sheet, other, settings, unit, least_of(settings, frame))
@@ -225,15 +225,30 @@ def make_maps(
     return record
 
 
-def draw(subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool) -> SurfaceModelStats:
-    """Draw the surface model, and the orthophoto if it is wanted."""
-    photographs = None
-    if colored and settings.colors == "photographs":
-        texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
-        made = textured(subject, TextureSettings(texel=texel), budget, TextureCache(sheet.folder))
-        photographs = OrthophotoColors(made, subject.frame, sheet, settings.tile)
-    colors = PRODUCT_FILES["orthophoto"] if colored else None
-    return draw_surface(subject.surface, sheet, settings.tile, PRODUCT_FILES["dsm"], colors, photographs)
+def draw(
+    subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool
+) -> tuple[SurfaceModelStats, dict[str, Any]]:
+    """Draw the surface model, and the orthophoto if it is wanted; what maps.json says of photographs in it."""
+    heights, colors, sources = (PRODUCT_FILES[name] for name in ("dsm", "orthophoto", "sources"))
+    by_photographs, target = colored and settings.colors == "photographs", None
+    under = Raster(sheet.folder / "mesh-colors", sheet.grid, sheet.crs, "colors", sheet.double)
+    if by_photographs:
+        under.folder.mkdir(exist_ok=True)
+        target = nullcontext(under)
+
+    def model() -> dict[str, Any]:
+        into = sheet.raster(colors, "colors") if colored and not by_photographs else target
+        return asdict(draw_surface(subject.surface, sheet, settings.tile, heights, into))
+
+    drawn = SurfaceModelStats(**sheet.once([heights, *[colors] * (colored and not by_photographs)], model))
+    if not by_photographs:
+        return drawn, {}
+    budget = cache_bytes(settings.memory, "--memory")
+    found = sheet.once(
+        [colors, sources], lambda: mosaic(subject, sheet, heights, under.whole(), (colors, sources), budget)
+    )
+    share = round(sum(each["cells"] for each in found["photographs"].values()) / drawn.covered, 6)
+    return drawn, {"from_photographs": share, **found}
 
 
 def grid_of(subject: MeshWithPhotos, settings: MapSettings, turn: np.ndarray) -> MapGrid:

@@ -10,13 +10,13 @@ from PIL import Image
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
 from surfkit.apps.maps.make_maps import MapSettings, make_maps
-from surfkit.apps.maps.orthophoto import between
+from surfkit.apps.maps.photo_sight import between
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.srgb import from_linear, linear
 
 rasterio = needs("rasterio")
-needs("fast_simplification")
+needs("cv2")
 SETTINGS = MapSettings(products=("orthophoto",), colors="photographs", gsd=0.1, up="z", memory="100MB", tile=64)
 
 

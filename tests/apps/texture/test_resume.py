@@ -30,8 +30,8 @@ SETTINGS = TextureSettings(size=128)
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
     """A town; what is seen is kept after every photograph."""
-    monkeypatch.setattr(make, "PAUSE_S", 0.0)
-    monkeypatch.setattr(make, "SAVE_PAUSE_FACTOR", 0.0)
+    monkeypatch.setattr(find_candidates, "PAUSE_S", 0.0)
+    monkeypatch.setattr(find_candidates, "SAVE_PAUSE_FACTOR", 0.0)
     (tmp_path / "photographs").mkdir()
     return town(tmp_path / "photographs")
 
