@@ -46,7 +46,7 @@ UNKNOWN_DIFFERENCE = 0.16
 """Where only one of the two photographs shows both sides."""
 EDGE_DIFFERENCE = 0.1
 """Of neighbouring blocks in one photograph, at which a cut line between them costs half."""
-RAISED_COST, RAISED_SHARE, OPENING_SHARE = 3.0, 0.02, 0.5
+RAISED_COST, RAISED_SHARE, OPENING_SHARE = 8.0, 0.02, 0.5
 """How much more a cut line costs on what rises by more than a share of the height of the cameras above its
 surroundings, and how far these reach, as a share of that height too."""
 UNSEEN_COST, UNSEEN_BLOCKS = 1.5, 3

@@ -60,8 +60,10 @@ def look(places: np.ndarray, camera: Camera, pieces: MeshClusters, keep: np.ndar
     depth = nearest(mesh.vertices, mesh.faces, part)
     focal, at = min(camera.fx, camera.fy), (row - top, column - left)
     seen = z <= depth[at] * (1 + HIDDEN_SLACK_PX / focal)
-    front = ndimage.minimum_filter(depth, 2 * OUTLINE_PX + 1)[at]
-    clear = z <= front * (1 + MIN_OUTLINE_STEP_PX / focal)
+    # the colour of a place is mixed from the pixels around it: nothing in front may be in one of them
+    around, near = (ndimage.minimum_filter(depth, 2 * reach + 1)[at] for reach in (1, OUTLINE_PX))
+    seen &= z <= around * (1 + MIN_OUTLINE_STEP_PX / focal)
+    clear = z <= near * (1 + MIN_OUTLINE_STEP_PX / focal)
     return Sight(rows[seen], x[seen], y[seen], clear[seen])
 
 
