@@ -4,7 +4,7 @@
 
 PACK is shibuya-synth. Its photographs are taken as they are, and with exposures of -0.5 to 0.5 stops. Told are the
 mean steps of grey between neighbouring cells, across cut lines and elsewhere, and what they are more than in an exact
-orthophoto (the mean of the photographs that look down, see bench/maps.py); connected pieces of one photograph; the share
+orthophoto (the mean of the photographs that look down, see bench/maps.py); connected pieces of one photograph; share
 of cells from photographs; corners of roofs that lie within a cell; CPU seconds and memory. --maps FOLDER measures maps
 that are there, of the exact mesh from the photographs as they are.
 """
