@@ -46,6 +46,10 @@ it is of a region and shows the cell near an outline; 0 for the rest, such as on
 share of the regions around, or how well it shows the block, from 0 to 1."""
 
 
+MIN_PIECE_CELLS = 16
+"""A piece of fewer cells of one photograph is left to that of the region, also near an outline."""
+
+
 @dataclass(frozen=True)
 class OrthophotoSource:
     """What an orthophoto is made from.
@@ -174,12 +178,20 @@ class Square:
             share = self._share(label == photo)
             ranks = [np.where(fits, each, np.float32(0))[self.at] + share for each in (WELL, BADLY)]
             self._offer(photo, near[self.at] & self.covered, ranks, rank)
-        poor, view = self.covered & (rank < WELL), view[self.at]
-        for photo in np.unique(view[poor]).tolist():
+        own, own_color, poor = self.number.copy(), self.color.copy(), self.covered & (rank < WELL)
+        around = 2 * -(-(1 << BANDS) // self.source.regions.block) + 1
+        full = (view != NO_PHOTO).all(-1)
+        for photo in np.unique(view[self.at][poor]).tolist():
             if photo != NO_PHOTO:
                 slot = view == photo
-                share = 1 - slot.argmax(-1).astype(np.float32) / view.shape[-1]
-                self._offer(photo, poor & slot.any(-1), [share + np.float32(ELSEWHERE), share], rank)
+                good = np.where(slot.any(-1), view.shape[-1] - slot.argmax(-1), 0).astype(np.float32)
+                for axis in (0, 1):  # around, so that neighbours take the same one; sums of whole numbers are exact
+                    good = ndimage.correlate1d(good, np.ones(around), axis)
+                mean = (good / (view.shape[-1] * around**2))[self.at]
+                there = poor & (slot.any(-1) | full)[self.at] & (mean > 0)
+                self._offer(photo, there, [mean + np.float32(ELSEWHERE), mean], rank)
+        crumbs = (own != self.number) & (own != NO_PHOTO) & small_pieces(self.number, poor)
+        self.number[crumbs], self.color[crumbs] = own[crumbs], own_color[crumbs]
 
     def _blocks(self) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """The labels of the blocks on the square and around it, and the row and column in them of each of its cells."""
@@ -262,6 +274,15 @@ class Square:
                 )
             result, _ = blender.blend(None, None)
         return np.rint(result / FINE).clip(0, 255).astype(np.uint8)
+
+
+def small_pieces(number: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """(H, W) bool cells of pieces of fewer than `MIN_PIECE_CELLS` cells with the same number; looked for at some."""
+    found = np.zeros(number.shape, bool)
+    for each in np.unique(number[where]).tolist():
+        piece, count = ndimage.label(number == each)
+        found |= (np.bincount(piece.reshape(-1), minlength=count + 1) < MIN_PIECE_CELLS)[piece] & (piece > 0)
+    return found & where
 
 
 def read_window(file: Path, window: Window) -> np.ndarray:
