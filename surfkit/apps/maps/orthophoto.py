@@ -44,8 +44,6 @@ WELL, ELSEWHERE, BADLY = 8.0, 4.0, 2.0
 """Ranks of photographs at a cell: it is of a region there or near and shows the cell well, it is another one that does,
 it is of a region and shows the cell near an outline; 0 for the rest, such as one that was refused there. Added is its
 share of the regions around, or how well it shows the block, from 0 to 1."""
-
-
 MIN_PIECE_CELLS = 16
 """A piece of fewer cells of one photograph is left to that of the region, also near an outline."""
 
@@ -148,10 +146,8 @@ class Square:
     def write(self, photo: Raster, labels: Raster) -> dict[str, list[list[int]]]:
         """Make the square, keep it, and return what is counted of it."""
         self._look_up()
-        inner = np.s_[self.window.top - self.wide.top :, self.window.left - self.wide.left :]
-        inner = np.s_[
-            inner[0].start : inner[0].start + self.window.height, inner[1].start : inner[1].start + self.window.width
-        ]
+        top, left = self.window.top - self.wide.top, self.window.left - self.wide.left
+        inner = np.s_[top : top + self.window.height, left : left + self.window.width]
         image = np.concatenate([self._blended(), np.where(self.covered, 255, 0).astype(np.uint8)[..., None]], axis=2)
         image[~self.covered] = 0
         photo.write(image[inner].transpose(2, 0, 1), self.window)
@@ -178,7 +174,8 @@ class Square:
             share = self._share(label == photo)
             ranks = [np.where(fits, each, np.float32(0))[self.at] + share for each in (WELL, BADLY)]
             self._offer(photo, near[self.at] & self.covered, ranks, rank)
-        own, own_color, poor = self.number.copy(), self.color.copy(), self.covered & (rank < WELL)
+        own, own_color = np.where(rank >= BADLY, self.number, NO_PHOTO), self.color.copy()
+        poor = self.covered & (rank < WELL)
         around = 2 * -(-(1 << BANDS) // self.source.regions.block) + 1
         full = (view != NO_PHOTO).all(-1)
         for photo in np.unique(view[self.at][poor]).tolist():
