@@ -21,7 +21,7 @@ import trimesh
 from machine import save
 from PIL import Image
 
-from surfkit.apps.maps.orthophoto import between
+from surfkit.apps.maps.photo_sight import between
 from surfkit.apps.texture.texture_mesh import local_mesh
 from surfkit.apps.texture.triangle_visibility import project
 from surfkit.evaluate.geometry.surface_file import read_surface

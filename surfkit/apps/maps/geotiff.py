@@ -68,7 +68,7 @@ class GeoTiffSettings:
         """A raster to write tiles of, that becomes the Cloud Optimized GeoTIFF `name` in `out` when all went well.
 
         Heights have NODATA where there is nothing; colours have a fourth channel that is 0 there and 255 elsewhere;
-        shades are 1 to 255, and 0 where there is nothing.
+        shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits.
         """
         import rasterio
 
@@ -85,7 +85,7 @@ class GeoTiffSettings:
             "compress": "DEFLATE",
             "predictor": "YES",
             "overviews": "IGNORE_EXISTING",
-            "resampling": "AVERAGE",
+            "resampling": "MODE" if kind == "numbers" else "AVERAGE",
             "bigtiff": "IF_SAFER",
             "sparse_ok": True,
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,16 +17,17 @@ from surfkit.apps.maps.difference import Difference, draw_difference, write_diff
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.hillshade import draw_hillshade
 from surfkit.apps.maps.map_grid import MapGrid, map_crs, shown
-from surfkit.apps.maps.orthophoto import OrthophotoColors
+from surfkit.apps.maps.orthophoto import mosaic
 from surfkit.apps.maps.owned_files import MAPS_RECORD, PRODUCT_FILES, claim, own_files
 from surfkit.apps.maps.precision import Rays, StereoDepths, write_precision
+from surfkit.apps.maps.rasters import Raster
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import TerrainSettings, find_ground, write_terrain
 from surfkit.apps.maps.volume_base import BaseKind
 from surfkit.apps.maps.volumes import VolumeSettings, measure_volumes, volumes_record, write_volumes
 from surfkit.apps.texture.resolution import ground_sampling_distance
-from surfkit.apps.texture.texture_cache import TextureCache, identity, seen
-from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, textured
+from surfkit.apps.texture.texture_cache import identity, seen
+from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
@@ -35,7 +37,6 @@ from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.io.area import bounds_of, read_area, require_area
 from surfkit.io.polygon_file import AreaPolygon, Site, read_polygons, require_polygons
-from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
@@ -98,8 +99,8 @@ class MapSettings:
     and the place where closed ones begin."""
 
     colors: Literal["photographs", "mesh"] = "mesh"
-    """Of the orthophoto: those of the photographs, one for each place, or those of the vertices of the mesh, which are
-    means of photographs or of renders."""
+    """Of the orthophoto: those of the photographs, a mosaic of large parts of them, or those of the vertices of the
+    mesh, which are means of photographs or of renders."""
 
     memory: str = "auto"
     """Memory for photographs, such as 4GB, with --colors photographs, and for depth maps, with `--products precision`;
@@ -159,7 +160,8 @@ class MapSettings:
         if self.area is not None:
             require_area()
         if self.colors == "photographs":
-            require_simplification("simplifying a mesh")
+            with needed("cv2", "--colors photographs"):
+                __import__("cv2")
 
 
 def make_maps(
@@ -206,8 +208,9 @@ def make_maps(
     if settings.volume is not None:
         polygons = read_polygons(settings.volume, VOLUME_OPTION, Site("the map", frame.crs, grid.bounds))
     done, unit = drawable(surface, settings), unit_of(frame)
-    files = [PRODUCT_FILES[name] for name in (*done, *(COMPARISON_FILES if other is not None else ()),
-             *(VOLUME_FILES if polygons else ()))]  # fmt: skip
+    from_photographs = "orthophoto" in done and settings.colors == "photographs"
+    files = [PRODUCT_FILES[name] for name in (*done, *["sources"] * from_photographs,
+             *(COMPARISON_FILES if other is not None else ()), *(VOLUME_FILES if polygons else ()))]  # fmt: skip
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
         grid.gsd, grid.bounds, identity(surface), other and identity(other),
@@ -218,10 +221,7 @@ def make_maps(
     with workshop(out, (*files, MAPS_RECORD), key) as folder:
         replaced = (MAPS_RECORD, *sorted(own_files(out) - {*files, MAPS_RECORD}))
         sheet = GeoTiffSettings(grid, crs, folder, out, needs_double(surface, grid), replaced)
-        drawn = SurfaceModelStats(**sheet.once(
-            [PRODUCT_FILES[name] for name in ("dsm", "orthophoto") if name in done],
-            lambda: asdict(draw(subject, settings, sheet, PRODUCT_FILES["orthophoto"] in files)),
-        ))  # fmt: skip
+        drawn, photographs = draw(subject, settings, sheet, "orthophoto" in done)
         record = {
             "mesh": str(surface.path),
             "crs": frame.crs,
@@ -238,8 +238,8 @@ def make_maps(
         }
         if grid.area is not None:
             record["area"] = grid.area.record()
-        if "orthophoto" in done and settings.colors == "photographs":
-            record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
+        if photographs:
+            record["orthophoto"] = photographs
         record |= draw_products(subject, settings, sheet, drawn, done)
         if "precision" in done and depths is not None:
             record["precision"] = estimate_precision(subject, depths, sheet, settings.tile)
@@ -253,15 +253,30 @@ def make_maps(
     return record
 
 
-def draw(subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool) -> SurfaceModelStats:
-    """Draw the surface model, and the orthophoto if it is wanted."""
-    photographs = None
-    if colored and settings.colors == "photographs":
-        texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
-        made = textured(subject, TextureSettings(texel=texel), budget, TextureCache(sheet.folder))
-        photographs = OrthophotoColors(made, subject.frame, sheet, settings.tile)
-    colors = PRODUCT_FILES["orthophoto"] if colored else None
-    return draw_surface(subject.surface, sheet, settings.tile, PRODUCT_FILES["dsm"], colors, photographs)
+def draw(
+    subject: MeshWithPhotos, settings: MapSettings, sheet: GeoTiffSettings, colored: bool
+) -> tuple[SurfaceModelStats, dict[str, Any]]:
+    """Draw the surface model, and the orthophoto if it is wanted; what maps.json says of photographs in it."""
+    heights, colors, sources = (PRODUCT_FILES[name] for name in ("dsm", "orthophoto", "sources"))
+    by_photographs, target = colored and settings.colors == "photographs", None
+    under = Raster(sheet.folder / "mesh-colors", sheet.grid, sheet.crs, "colors", sheet.double)
+    if by_photographs:
+        under.folder.mkdir(exist_ok=True)
+        target = nullcontext(under)
+
+    def model() -> dict[str, Any]:
+        into = sheet.raster(colors, "colors") if colored and not by_photographs else target
+        return asdict(draw_surface(subject.surface, sheet, settings.tile, heights, into))
+
+    drawn = SurfaceModelStats(**sheet.once([heights, *[colors] * (colored and not by_photographs)], model))
+    if not by_photographs:
+        return drawn, {}
+    budget = cache_bytes(settings.memory, "--memory")
+    found = sheet.once(
+        [colors, sources], lambda: mosaic(subject, sheet, heights, under.whole(), (colors, sources), budget)
+    )
+    share = round(sum(each["cells"] for each in found["photographs"].values()) / drawn.covered, 6)
+    return drawn, {"from_photographs": share, **found}
 
 
 def grid_of(subject: MeshWithPhotos, settings: MapSettings, turn: np.ndarray) -> MapGrid:

@@ -113,6 +113,13 @@ class MapGrid:
         found[..., 1] = self.north - found[..., 1] / self.gsd
         return found
 
+    def from_cells(self, cells: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 positions in the frame of the input, of column, row and height: see `to_cells`."""
+        found = np.array(cells, np.float64)
+        found[..., 0] = (found[..., 0] + self.west) * self.gsd
+        found[..., 1] = (self.north - found[..., 1]) * self.gsd
+        return found if np.array_equal(self.turn, np.eye(3)) else found @ self.turn
+
     def tiles(self, side: int) -> Iterator[Window]:
         """Squares of so many cells that cover the map, row by row; smaller at its right and lower borders."""
         for top in range(0, self.height, side):

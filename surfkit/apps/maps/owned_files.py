@@ -13,7 +13,8 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.stages import UNFINISHED_FILE, delete_parts
 
 PRODUCT_FILES = {
-    "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
+    "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "sources": "orthophoto-photographs.tif",
+    "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.copc.laz", "precision": "precision.tif", "rays": "rays.tif",
     "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",

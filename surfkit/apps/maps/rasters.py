@@ -18,8 +18,13 @@ TILE_SIDE_CELLS = 512
 """Side of the tiles within a file, cells."""
 NODATA = -9999.0
 """Height where there is no surface."""
-Kind = Literal["heights", "colors", "shades"]
-CHANNELS = {"heights": ("Gray",), "colors": ("Red", "Green", "Blue", "Alpha"), "shades": ("Gray",)}
+Kind = Literal["heights", "colors", "shades", "numbers"]
+CHANNELS = {
+    "heights": ("Gray",),
+    "colors": ("Red", "Green", "Blue", "Alpha"),
+    "shades": ("Gray",),
+    "numbers": ("Gray",),
+}
 FACTS_TAG = "surfkit"
 """Tag of a tile for what was counted when it was drawn."""
 
@@ -45,12 +50,13 @@ class Raster:
     @property
     def dtype(self) -> str:
         """Of the cells."""
-        return ("float64" if self.double else "float32") if self.kind == "heights" else "uint8"
+        kinds = {"heights": "float64" if self.double else "float32", "numbers": "uint32"}
+        return kinds.get(self.kind, "uint8")
 
     @property
     def nodata(self) -> float | None:
         """What cells without a surface have; None where a channel says it."""
-        return {"heights": NODATA, "colors": None, "shades": 0}[self.kind]
+        return {"heights": NODATA, "colors": None, "shades": 0, "numbers": 0}[self.kind]
 
     def write(self, image: np.ndarray, window: Window, facts: dict[str, Any] | None = None) -> None:
         """Keep a tile, and what was counted when it was drawn; tiles that are not written are empty.
@@ -100,7 +106,7 @@ class Raster:
         place = west, grid.gsd, 0.0, north, 0.0, -grid.gsd
         ElementTree.SubElement(root, "GeoTransform").text = ", ".join(map(repr, place))
         tiles = sorted(self.folder.glob("*.tif"))
-        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte"}[self.dtype]
+        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint32": "UInt32"}[self.dtype]
         for channel, color in enumerate(CHANNELS[self.kind], 1):
             band = ElementTree.SubElement(root, "VRTRasterBand", dataType=kind, band=str(channel))
             if self.nodata is not None:

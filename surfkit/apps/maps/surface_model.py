@@ -1,8 +1,8 @@
-"""The digital surface model, the highest surface above each cell, and the true orthophoto, the colours of it."""
+"""The digital surface model, the highest surface above each cell, and the colours of its vertices."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,7 @@ import numpy as np
 from surfkit.apps.maps.bins import Bins, corners_of, sort_faces
 from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.map_grid import MapGrid, Window
-from surfkit.apps.maps.orthophoto import OrthophotoColors
-from surfkit.apps.maps.rasters import NODATA
+from surfkit.apps.maps.rasters import NODATA, Raster
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE, ZBuffer, barycentric
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
@@ -34,13 +33,11 @@ class SurfaceModelStats:
         covered: Cells with a surface.
         lowest: Height, units of the input.
         highest: The same.
-        from_photographs: Cells with the colour of a photograph.
     """
 
     covered: int
     lowest: float
     highest: float
-    from_photographs: int = 0
 
 
 def has_colors(surface: SurfaceFile) -> bool:
@@ -53,18 +50,16 @@ def draw_surface(
     sheet: GeoTiffSettings,
     side: int,
     heights: str,
-    colors: str | None = None,
-    photographs: OrthophotoColors | None = None,
+    colors: AbstractContextManager[Raster] | None = None,
 ) -> SurfaceModelStats:
-    """Write the surface model, and the orthophoto, of a mesh.
+    """Write the surface model of a mesh, and the colours of its vertices.
 
     Args:
         surface: The mesh, in the frame of the input.
         sheet: Where.
         side: Cells of a tile, along each side, on which memory depends.
         heights: File name of the surface model.
-        colors: File name of the orthophoto; None for none.
-        photographs: What has the colours of the cells that photographs show; None for those of the vertices everywhere.
+        colors: For the colours; None for none.
 
     Raises:
         BadInput: No cell has a surface.
@@ -73,15 +68,13 @@ def draw_surface(
     windows, found = list(sheet.grid.tiles(side)), []
     with ExitStack() as files:
         model = files.enter_context(sheet.raster(heights, "heights"))
-        photo = None if colors is None else files.enter_context(sheet.raster(colors, "colors"))
+        photo = None if colors is None else files.enter_context(colors)
         for tile, window in enumerate(windows):
             facts = model.facts(window)
             if facts is None and (buffer := drawn_tile(bins, tile, window)).covered.any():
                 facts = facts_of(buffer)
                 if photo is not None:
-                    image = colors_of(buffer, bins)
-                    facts["from_photographs"] = 0 if photographs is None else photographs.over(tile, buffer, image)
-                    photo.write(image, window)
+                    photo.write(colors_of(buffer, bins), window)
                 model.write(np.where(buffer.covered, buffer.height, NODATA), window, facts)  # last: the tile is done
             found += [] if facts is None else [facts]
             emit(Progress(f"drawing {Path(heights).stem}", tile + 1, len(windows)))
@@ -94,7 +87,6 @@ def draw_surface(
         sum(facts["covered"] for facts in found),
         min(facts["lowest"] for facts in found),
         max(facts["highest"] for facts in found),
-        sum(facts.get("from_photographs", 0) for facts in found),
     )
 
 

@@ -30,23 +30,14 @@ class MeshClusters:
         order = np.argsort(number, kind="stable")
         starts = np.flatnonzero(np.diff(number[order], prepend=-1))
         corners = mesh.vertices[mesh.faces[order]]
-        ends = np.stack([np.minimum.reduceat(corners.min(1), starts), np.maximum.reduceat(corners.max(1), starts)])
-        sides = np.array(list(product((0, 1), repeat=3)))
+        ends = np.minimum.reduceat(corners.min(1), starts), np.maximum.reduceat(corners.max(1), starts)
         self.mesh = mesh
         self.rows = np.split(order, starts[1:])
-        self.boxes = ends[sides, :, np.arange(3)].transpose(2, 0, 1)  # (P, 8, 3) corners
+        self.boxes = box_corners(*ends)
 
     def in_view(self, camera: Camera) -> tuple[Mesh, np.ndarray]:
         """The pieces that may lie in a picture, as a mesh, and (n,) rows of its triangles in the whole one, rising."""
-        pose = camera.world_to_camera.numpy()
-        x, y, z = np.moveaxis(self.boxes @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3], 2, 0)
-        left, right = (
-            camera.fx * x + (camera.cx + side) * z for side in (PIECE_MARGIN_PX, -camera.width - PIECE_MARGIN_PX)
-        )
-        top, bottom = (
-            camera.fy * y + (camera.cy + side) * z for side in (PIECE_MARGIN_PX, -camera.height - PIECE_MARGIN_PX)
-        )
-        outside = np.any([(side <= 0).all(1) for side in (z, left, -right, top, -bottom)], axis=0)
+        outside = ~may_show(self.boxes, camera)
         if not outside.any():
             return self.mesh, np.arange(len(self.mesh.faces))
         rows = np.concatenate([np.empty(0, np.int64), *(self.rows[at] for at in np.flatnonzero(~outside))])
@@ -59,3 +50,22 @@ class MeshClusters:
         return replace(
             self.mesh, vertices=self.mesh.vertices[used], faces=number[faces].astype(np.int32), colors=colors
         ), rows
+
+
+def may_show(boxes: np.ndarray, camera: Camera) -> np.ndarray:
+    """(P,) bool whether something within boxes, whose (P, 8, 3) corners are given, may lie in a picture."""
+    pose = camera.world_to_camera.numpy()
+    x, y, z = np.moveaxis(boxes @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3], 2, 0)
+    left, right = (
+        camera.fx * x + (camera.cx + side) * z for side in (PIECE_MARGIN_PX, -camera.width - PIECE_MARGIN_PX)
+    )
+    top, bottom = (
+        camera.fy * y + (camera.cy + side) * z for side in (PIECE_MARGIN_PX, -camera.height - PIECE_MARGIN_PX)
+    )
+    return ~np.any([(side <= 0).all(1) for side in (z, left, -right, top, -bottom)], axis=0)
+
+
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(P, 8, 3) corners of boxes with (P, 3) least and greatest coordinates."""
+    sides = np.array(list(product((0, 1), repeat=3)))
+    return np.stack([low, high])[sides, :, np.arange(3)].transpose(2, 0, 1)

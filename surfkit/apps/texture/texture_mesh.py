@@ -14,6 +14,7 @@ import numpy as np
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.choose import choose_views
 from surfkit.apps.texture.fill import PaintInput, Pictures
+from surfkit.apps.texture.find_candidates import LOOKED_FOLDER, candidates_of
 from surfkit.apps.texture.pieces import MeshClusters
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
 from surfkit.apps.texture.regions import Region, divide, middles
@@ -23,10 +24,10 @@ from surfkit.apps.texture.texture_atlas import MAX_FILLED_SHARE, Atlas, make_atl
 from surfkit.apps.texture.texture_cache import Arrays, TextureCache, identity, seen
 from surfkit.apps.texture.texture_export import TEXTURED_NAME, TILES_FOLDER, TexturedMesh, TextureExport, deliver
 from surfkit.apps.texture.topology import neighbours, with_short_edges
-from surfkit.apps.texture.triangle_visibility import project, sight
+from surfkit.apps.texture.triangle_visibility import TriangleVisibility, project, sight
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
-from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
+from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.files import refuse_own, replacing_folder
 from surfkit.core.lock import locked
 from surfkit.core.stages import kept_parts, key_of
@@ -38,7 +39,7 @@ from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
-from surfkit.scene.radiometry import Radiometry, camera_numbers, estimate
+from surfkit.scene.radiometry import Radiometry
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d", "usdz"]
@@ -46,9 +47,6 @@ TEXTURE_RECORD = "texture.json"
 """What the textured mesh is; written last."""
 UNFINISHED_SUFFIX = ".unfinished"
 """Ending of the name of the folder, beside the one that is written, for what is finished of it."""
-LOOKED_FOLDER, PAUSE_S, SAVE_PAUSE_FACTOR = "looked", 20.0, 30.0
-"""What was seen in the photographs so far is kept every `PAUSE_S` seconds, or `SAVE_PAUSE_FACTOR` times as long as that
-takes."""
 TEXELS_PER_TRIANGLE = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 MAX_EDGE_TEXELS, MAX_EDGE_RATIO = 32.0, 4.0
@@ -338,33 +336,17 @@ def look_at_all(
     light: Radiometry | None = None,
 ) -> tuple[Candidates, Radiometry, int]:
     """What can be chosen from, the light of the photographs, and how many photographs of a triangle were refused."""
-    found, count = Candidates(len(mesh.faces)), len(photos.views)
-    pieces, start = MeshClusters(mesh), 0
-    if (before := kept.read(LOOKED_FOLDER)) is not None:
-        start = int(before.pop("count"))
-        vars(found).update(before)
-    photos.expect(range(start, count))
-    saved, spent = time.perf_counter(), 0.0
-    for number in range(start, count):
-        view = photos.views[number]
-        try:
-            picture, keep = photos(number), photos.keep(number)
-        except BadInput as error:
-            emit(PhotoSkipped(view.name, str(error)))
-            continue
-        part, rows = pieces.in_view(view.camera)
-        if len(rows):
-            shown = sight(part, view.camera, picture, keep, longest)
-            found.offer(number, replace(shown, faces=rows[shown.faces]))
-        now = time.perf_counter()
-        if now - saved > max(PAUSE_S, SAVE_PAUSE_FACTOR * spent):
-            kept.write(LOOKED_FOLDER, {**vars(found), "count": np.array(number + 1)})
-            saved = time.perf_counter()
-            spent = saved - now
-        emit(Progress("looking at photographs", number + 1, count))
-    light = light or estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
-    found.shun_clipped()
-    return found, light, found.refuse_outliers(light)
+    pieces = MeshClusters(mesh)
+
+    def show(number: int, picture: np.ndarray, keep: np.ndarray | None) -> TriangleVisibility | None:
+        camera = photos.views[number].camera
+        part, rows = pieces.in_view(camera)
+        if not len(rows):
+            return None
+        shown = sight(part, camera, picture, keep, longest)
+        return replace(shown, faces=rows[shown.faces])
+
+    return candidates_of(len(mesh.faces), photos, show, kept, light)
 
 
 def lay_out(

@@ -140,11 +140,11 @@ def test_no_run_and_no_mesh(tmp_path, run, capsys):
     assert "splats, which are no surface; name a mesh" in capsys.readouterr().err
 
 
-def test_without_the_package_of_textures_nothing_is_read(run, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+def test_without_the_package_of_mosaics_nothing_is_read(run, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "cv2", None)
     monkeypatch.setattr("surfkit.apps.maps.command.read_unchanged", lambda run: pytest.fail("the data set is read"))
     assert main(["maps", str(run), "--colors", "photographs"]) == 2
-    assert "needs the package fast_simplification" in capsys.readouterr().err
+    assert "needs the package cv2" in capsys.readouterr().err
 
 
 def test_without_rasterio_one_line_says_what_to_install(run, monkeypatch, capsys):

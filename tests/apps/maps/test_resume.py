@@ -9,11 +9,11 @@ from interrupted import digests, interrupted_often
 from needs import needs
 from town import town
 
-from surfkit.apps.maps import contours, surface_model
+from surfkit.apps.maps import contours, orthophoto, photo_regions, surface_model
 from surfkit.apps.maps import make_maps as making
 from surfkit.apps.maps.make_maps import MapSettings, MeshWithPhotos, make_maps
 from surfkit.apps.maps.owned_files import NAMES_FILE, UNFINISHED_FOLDER
-from surfkit.apps.texture import texture_mesh as texturing
+from surfkit.apps.texture import find_candidates
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.scene.scene import Frame
@@ -64,17 +64,19 @@ def test_the_same_bytes_after_an_interruption_anywhere(tmp_path, monkeypatch, sa
 
 
 def test_colors_of_photographs_too(tmp_path, monkeypatch):
-    needs("fast_simplification")
-    monkeypatch.setattr(texturing, "PAUSE_S", 0.0)
-    monkeypatch.setattr(texturing, "SAVE_PAUSE_FACTOR", 0.0)
+    needs("cv2")
+    monkeypatch.setattr(orthophoto, "SIDE", 32)
+    monkeypatch.setattr(find_candidates, "PAUSE_S", 0.0)
+    monkeypatch.setattr(find_candidates, "SAVE_PAUSE_FACTOR", 0.0)
     (tmp_path / "town").mkdir()
     scene = town(tmp_path / "town")
     subject = MeshWithPhotos(scene.surface, scene.frame, scene.views)
     settings = MapSettings(("orthophoto",), colors="photographs", gsd=0.3, up="z", memory="100MB", tile=48)
     make_maps(subject, settings, tmp_path / "whole")
-    looks = counted(monkeypatch, texturing, "sight")
+    looks, squares = counted(monkeypatch, photo_regions, "look"), counted(monkeypatch, orthophoto.Square, "write")
     interrupted_often(lambda: make_maps(subject, settings, tmp_path / "parts"))
     assert digests(tmp_path / "parts") == digests(tmp_path / "whole") and len(looks) == len(scene.views)
+    assert len(squares) == 4, "what is finished is not done again"
 
 
 def stopped(monkeypatch, subject, settings, out):

@@ -82,7 +82,8 @@ def written(surface, out, side, gsd=0.25, frame=None):
     grid = grid_of(gsd, UTM[0] - 3, UTM[1] - 3, UTM[0] + 63, UTM[1] + 63)
     crs, _ = map_crs(frame or Frame(np.zeros(3), 1.0, 1.0, "EPSG:32633"))
     with workshop(out, ("dsm.tif",)) as folder:
-        facts = draw_surface(surface, GeoTiffSettings(grid, crs, folder, out), side, "dsm.tif", "orthophoto.tif")
+        sheet = GeoTiffSettings(grid, crs, folder, out)
+        facts = draw_surface(surface, sheet, side, "dsm.tif", sheet.raster("orthophoto.tif", "colors"))
     return grid, facts
 
 

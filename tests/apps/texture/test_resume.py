@@ -9,6 +9,7 @@ from interrupted import digests, interrupted_often
 from needs import needs
 from town import town
 
+from surfkit.apps.texture import find_candidates
 from surfkit.apps.texture import texture_export as deliver
 from surfkit.apps.texture import texture_mesh as make
 from surfkit.apps.texture.texture_cache import TextureCache
@@ -30,8 +31,8 @@ SETTINGS = TextureSettings(size=128)
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
     """A town; what is seen is kept after every photograph."""
-    monkeypatch.setattr(make, "PAUSE_S", 0.0)
-    monkeypatch.setattr(make, "SAVE_PAUSE_FACTOR", 0.0)
+    monkeypatch.setattr(find_candidates, "PAUSE_S", 0.0)
+    monkeypatch.setattr(find_candidates, "SAVE_PAUSE_FACTOR", 0.0)
     (tmp_path / "photographs").mkdir()
     return town(tmp_path / "photographs")
 
@@ -99,7 +100,7 @@ def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
 def test_a_photograph_that_is_gone_is_passed_over(scene, tmp_path, monkeypatch):
     scene.views[3].path.unlink()
     said = []
-    monkeypatch.setattr(make, "emit", said.append)
+    monkeypatch.setattr(find_candidates, "emit", said.append)
     made(scene, tmp_path / "out", replace(SETTINGS, formats=("glb",)))
     assert [event.name for event in said if isinstance(event, PhotoSkipped)] == [scene.views[3].name]
 
