@@ -25,7 +25,8 @@ from machine import save
 from maps import corners_of, exact_orthophoto, heights_of, shift_of
 from scipy import ndimage
 
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data

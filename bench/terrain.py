@@ -26,8 +26,9 @@ from holes import read_grid
 from machine import save
 from scipy import ndimage
 
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
 from surfkit.apps.maps.map_grid import MapGrid, Window
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.zbuffer import ZBuffer
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface

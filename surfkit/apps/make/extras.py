@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from surfkit.apps.maps.make_maps import USUAL_PRODUCTS, Product
-from surfkit.apps.maps.make_maps import MapSettings as Maps
 from surfkit.apps.maps.map_grid import map_crs
+from surfkit.apps.maps.map_settings import USUAL_PRODUCTS, Product
+from surfkit.apps.maps.map_settings import MapSettings as Maps
 from surfkit.apps.quality.pdf_writer import require_reportlab
 from surfkit.apps.texture.texture_mesh import TextureSettings, refuse_unplaced
 from surfkit.core.check import BadInput

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.maps.make_maps import MAPS_RECORD, MapSettings, make_maps
+from surfkit.apps.maps.make_maps import MAPS_RECORD, make_maps
 from surfkit.apps.maps.map_grid import same_crs
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.precision import StereoDepths
 from surfkit.apps.maps.volume_table import show_volumes
 from surfkit.apps.texture.texture_cache import seen

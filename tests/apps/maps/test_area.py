@@ -7,7 +7,8 @@ import pytest
 from needs import needs
 from polygon_files import write_polygons
 
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.scene.scene import Frame

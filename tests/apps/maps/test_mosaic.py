@@ -12,7 +12,8 @@ from town import Town, looking, seen_from, sheet
 
 from surfkit.apps.maps import orthophoto, photo_regions
 from surfkit.apps.maps.graph_cut import expanded
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.texture import find_candidates
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.evaluate.geometry.surface_file import SurfaceFile

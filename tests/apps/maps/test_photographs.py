@@ -9,7 +9,8 @@ from needs import needs
 from PIL import Image
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.photo_sight import between
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.scene.srgb import from_linear, linear

@@ -7,7 +7,8 @@ import pytest
 import torch
 from needs import needs
 
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.precision import (
     DISAGREEMENT_SHARE,
     LEAST_RAYS,

@@ -16,8 +16,9 @@ from surfkit.apps.maps.difference import write_difference
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.hillshade import hillshade
 from surfkit.apps.maps.joined_lines import joined
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
 from surfkit.apps.maps.map_grid import Window, map_crs, same_crs
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput

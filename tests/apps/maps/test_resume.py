@@ -11,7 +11,8 @@ from town import town
 
 from surfkit.apps.maps import contours, orthophoto, photo_regions, surface_model
 from surfkit.apps.maps import make_maps as making
-from surfkit.apps.maps.make_maps import MapSettings, MeshWithPhotos, make_maps
+from surfkit.apps.maps.make_maps import MeshWithPhotos, make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.owned_files import NAMES_FILE, UNFINISHED_FOLDER
 from surfkit.apps.texture import find_candidates
 from surfkit.core.check import BadInput

@@ -7,7 +7,8 @@ from needs import needs
 
 from surfkit.apps.maps import terrain
 from surfkit.apps.maps.ground_filter import between_cells, fill_smoothly, roughness
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.terrain import TerrainSettings
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput

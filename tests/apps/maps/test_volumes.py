@@ -10,8 +10,9 @@ import pytest
 from needs import needs
 
 from surfkit.apps.maps.cell_shares import outline_pieces
-from surfkit.apps.maps.make_maps import MapSettings, make_maps
+from surfkit.apps.maps.make_maps import make_maps
 from surfkit.apps.maps.map_grid import Window
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.scene.scene import Frame
