@@ -269,7 +269,7 @@ class Square:
                 blender.feed(
                     np.ascontiguousarray(image[part]), mask[part].astype(np.uint8) * 255, (int(left), int(top))
                 )
-            result, _ = blender.blend(None, None)
+            result, _ = blender.blend(None, None)  # type: ignore[call-overload]  # both are made by OpenCV
         return np.rint(result / FINE).clip(0, 255).astype(np.uint8)
 
 
