@@ -62,8 +62,8 @@ def write_cloud(
     header.scales, header.offsets = np.full(3, step), np.round((low + high) / 2)
     header.vlrs.append(WktCoordinateSystemVlr(sheet.crs.to_wkt(version="WKT1_GDAL")))
     header.global_encoding.wkt = True
-    corners = np.floor((low - header.offsets) / step), np.ceil((high - header.offsets) / step)
-    octree = Octree.around(*(corner.astype(np.int64) for corner in corners), spacing / step)
+    least, most = np.floor((low - header.offsets) / step), np.ceil((high - header.offsets) / step)
+    octree = Octree.around(least.astype(np.int64), most.astype(np.int64), spacing / step)
     path, counts = sheet.folder / name, np.zeros(256, np.int64)
     spill = path.with_suffix(".points")
     points = SortedPoints(spill, octree.low, octree.side)

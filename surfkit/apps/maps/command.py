@@ -88,6 +88,8 @@ class MapsCommand:
 
     def _other(self, against: Path, frame: Frame) -> SurfaceFile:
         """The mesh to subtract; BadInput if it is known to lie in other coordinates."""
+        if not against.exists():
+            raise BadInput(f"--against {against}: no such file or run")
         if not against.is_dir():
             system = system_of(against)
             if system is not None and frame.crs is not None and not same_plan(system, frame.crs):

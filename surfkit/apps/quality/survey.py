@@ -204,7 +204,7 @@ def open_survey(target: Path) -> Survey:
     prepared = _prepared_folder(data.path)
     return Survey(
         target, data, scene, delivery, _object(prepared / REPORT_FILE) if prepared is not None else {},
-        *(_object(folder / name) for name in ("run.json", "metrics.json", "mesh.json")),
+        _object(folder / "run.json"), _object(folder / "metrics.json"), _object(folder / "mesh.json"),
         _object(maps_folder / MAPS_RECORD), run, maps_folder,
         () if prepared is None else known_photographs(prepared / WORK_FOLDER / PHOTOGRAPHS_FILE),
     )  # fmt: skip

@@ -66,7 +66,7 @@ class USD(Format):
         notes = {"up": up, "kind": table.kind, "antialias": table.antialias}
         if frame is not None:
             notes |= {"offset": tuple(frame.shift), "crs": frame.crs}
-        stage = new_stage("Z" if up == "z" else "Y", frame and frame.metres, notes)
+        stage = new_stage("Z" if up == "z" else "Y", None if frame is None else frame.metres, notes)
         centre, turn = centre_of(table, MAX_EXTENTS_OFFSET), np.eye(3) if up == "z" else UPS[up]
         if centre.any():
             table = replace(table, means=table.means.double() - torch.from_numpy(centre))

@@ -73,7 +73,7 @@ def test_cells_outside_of_the_area_have_no_data(tmp_path, shape, tile):
     lines = shapely.from_wkb(raw.read(tmp_path / "maps/contours.gpkg")[2])
     assert len(lines) > 3 and shapely.covers(shape.buffer(GSD), lines).all()
     assert shapely.length(lines).sum() == pytest.approx(shape.area * 0.3 / 0.5, rel=0.1)
-    cloud = needs("laspy").read(tmp_path / "maps/points.laz")
+    cloud = needs("laspy").read(tmp_path / "maps/points.copc.laz")
     assert shapely.covers(shape.buffer(1e-3), shapely.points(cloud.x, cloud.y)).all()
     assert len(cloud) == pytest.approx(shape.area * 1.045 / 0.2**2, rel=0.03)
 

@@ -121,7 +121,7 @@ def test_maps_go_on_after_the_process_was_killed(run, tmp_path):
         (["--gsd", "0"], "--gsd 0: it is a length"),
         (["--gsd", "1", "--bounds", "100", "100", "120", "120"], "not in the same place"),
         (["--gsd", "1e-9"], "too many for one map"),
-        (["--against", "nowhere.ply"], "nowhere.ply: no such file"),
+        (["--against", "nowhere.ply"], "--against nowhere.ply: no such file or run"),
         (["--metres-per-unit", "-1"], "--metres-per-unit"),
         (["--colors", "photographs"], "--colors photographs: --products leaves the orthophoto out"),
     ],
@@ -171,4 +171,4 @@ def test_volumes_of_a_run_are_printed_and_lines_are_refused(run, tmp_path, capsy
     assert found["net"] == pytest.approx(16) and found["polygons"][0]["net_since"] == pytest.approx(16, rel=0.1)
     assert {"volumes.csv", "volumes.gpkg"} <= {path.name for path in (tmp_path / "m").iterdir()}
     assert main([*words, "--volume", str(tmp_path / "LineString.geojson")]) == 2
-    assert "only polygons have a volume" in capsys.readouterr().err
+    assert "it is a LineString; only polygons have an area" in capsys.readouterr().err

@@ -23,6 +23,8 @@ CONTROL = {
     "checkpoints": ["B1"],
     "left_out": [],
     "in_too_few_photographs": [],
+    "marks_px": {"A1": {"a.jpg": [0.3, 0.4], "b.jpg": [-0.3, 0.4], "c.jpg": [12.0, 5.0]}, "B1": {"a.jpg": [1.0, 0.0]}},
+    "wrong_marks": [{"point": "A1", "photograph": "c.jpg", "pixels": 13.0, "certain": True}],
 }
 
 

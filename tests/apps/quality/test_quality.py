@@ -208,8 +208,9 @@ def test_the_ground_sampling_distance_is_height_by_focal_length(survey):
 def test_control_points_are_listed_with_their_photographs(survey):
     section = control(survey)
     rows = {row[0]: row[1:] for row in table(section, "Residuals, m").rows}
-    assert rows["A1"] == ("control", "0.010", "-0.020", "0.030", "0.037", "4")
-    assert rows["B1"] == ("check", "0.120", "-0.050", "0.330", "0.355", "4")
+    assert rows["A1"] == ("control", "0.010", "-0.020", "0.030", "0.037", "2", "0.50"), "without the wrong mark"
+    assert rows["B1"] == ("check", "0.120", "-0.050", "0.330", "0.355", "1", "1.00")
+    assert table(section, "Marks left out").rows == (("A1", "c.jpg", "13.0"),)
     sums = {row[0]: row[1:] for row in table(section, "Control and check points, m").rows}
     assert sums["control, mean"] == ("0.000", "0.000", "0.003", "3")
     assert sums["control, RMS"] == ("0.008", "0.016", "0.025", "3")

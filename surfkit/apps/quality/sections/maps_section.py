@@ -85,7 +85,7 @@ def sparse_picture(survey: Survey, part: float) -> Figure | None:
     with styled():
         canvas, axes = drawing(part, 0.9)
         colours = survey.scene.cloud.rgb.numpy()[near] / 255
-        axes.scatter(*placed[near, :2].T, c=colours, s=2, linewidths=0)
+        axes.scatter(placed[near, 0], placed[near, 1], c=colours, s=2, linewidths=0)
         as_map(axes, bounds_about(np.stack([low, high])), survey.unit, survey.scene.frame.crs is not None)
         return finished(canvas, "Tie points from above", part, photographic=True)
 

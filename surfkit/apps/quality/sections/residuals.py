@@ -14,7 +14,7 @@ from surfkit.apps.quality.sections.words import fixed, moments
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import mapping, texts, value_at
 from surfkit.apps.sfm.dataset_export import file_name
-from surfkit.apps.sfm.ground_control import GroundControlPoint, read_list
+from surfkit.apps.sfm.control_list import GroundControlPoint, read_list
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.crs_names import system_of
 
@@ -119,10 +119,10 @@ def control(survey: Survey) -> Section:
     rows = []
     for name, values in residuals.items():
         kind = "check" if name in checks else "left out" if name in wrong else "control"
-        point = listed.get(name)
-        marks = fixed(None, 0) if point is None else str(len(point.marks))
-        rows.append((name, kind, *(fixed(value, 3) for value in (*values, np.linalg.norm(values))), marks))
-    head = ("point", "kind", *AXES, "3D", "photographs")
+        marks = mark_lengths(told, name)
+        seen = (str(len(marks)), fixed(float(np.sqrt(np.mean(marks**2))), 2)) if len(marks) else (fixed(None, 0),) * 2
+        rows.append((name, kind, *(fixed(value, 3) for value in (*values, np.linalg.norm(values))), *seen))
+    head = ("point", "kind", *AXES, "3D", "photographs", "marks, RMS px")
     elements: list[Element] = [
         Table("Residuals, m", head, tuple(rows), "Surveyed coordinates less those of the model.")
     ]
@@ -134,6 +134,11 @@ def control(survey: Survey) -> Section:
         ):
             sums.append((f"{kind}, {name}", *(fixed(value, 3) for value in values), str(len(known))))
     elements.append(Table("Control and check points, m", ("", *AXES, "points"), tuple(sums)))
+    if bad := [mark for mark in told.get("wrong_marks") or () if isinstance(mark, dict)]:
+        listed_marks = tuple((str(mark.get("point")), str(mark.get("photograph")), _pixels(mark)) for mark in bad)
+        elements.append(
+            Table("Marks left out", ("point", "photograph", "off by, px"), listed_marks, "They contradict the others.")
+        )
     if unseen := texts(told, "in_too_few_photographs"):
         elements.append(Paragraph(f"In too few photographs to be used: {', '.join(unseen)}.", "warning"))
     if why:
@@ -141,6 +146,18 @@ def control(survey: Survey) -> Section:
     if places := {name: np.array(listed[name].xyz) for name in residuals if name in listed}:
         elements.append(control_figure(survey, places, residuals, checks, wrong))
     return Section("Control and check points", tuple(elements))
+
+
+def mark_lengths(told: dict[str, Any], point: str) -> np.ndarray:
+    """(M,) pixels by which the marks of a point in photographs lie off, those left out not among them."""
+    wrong = {(mark.get("point"), mark.get("photograph")) for mark in told.get("wrong_marks") or ()}
+    rows = [row for name, row in mapping(told, "marks_px", point).items() if (point, name) not in wrong]
+    return np.linalg.norm(np.array(rows, np.float64).reshape(-1, 2), axis=1)
+
+
+def _pixels(mark: dict[str, Any]) -> str:
+    value = mark.get("pixels")
+    return fixed(float(value) if isinstance(value, (int, float)) else None, 1)
 
 
 def listed_points(survey: Survey) -> tuple[dict[str, GroundControlPoint], str]:
