@@ -29,11 +29,11 @@ from surfkit.scene.scene import Frame, View
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-RAY_ERROR_PX = 0.12
+RAY_ERROR_PX = 0.06
 """Standard deviation of a ray, pixels."""
-DISAGREEMENT_SHARE = 0.3
+DISAGREEMENT_SHARE = 0.16
 """Of the root mean square by which rays miss the surface in height: what is left of it in their mean."""
-STEP_SHARE = 0.7
+STEP_SHARE = 0.72
 """Of the greatest difference of heights within a pixel around."""
 AGREEING_PX, STEEPEST = 3.0, 3.0
 """A ray agrees with the surface within so many pixels, times what the slope makes of that; slopes up to this count."""
