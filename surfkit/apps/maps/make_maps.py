@@ -271,10 +271,11 @@ def measure(
 ) -> dict[str, Any]:
     """Measure volumes, write them, and return what maps.json says of them."""
     other = sheet.out / PRODUCT_FILES["other"] if two_dates else None
+    errors = sheet.out / PRODUCT_FILES["precision"] if "precision" in settings.products else None
 
     def made() -> dict[str, Any]:
         found = measure_volumes(
-            sheet, sheet.out / PRODUCT_FILES["dsm"], other, polygons, VolumeSettings(settings.base, least)
+            sheet, sheet.out / PRODUCT_FILES["dsm"], other, errors, polygons, VolumeSettings(settings.base, least)
         )
         write_volumes(sheet, polygons, found, *(PRODUCT_FILES[name] for name in VOLUME_FILES))
         return volumes_record(found)

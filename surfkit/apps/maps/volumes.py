@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,6 +51,9 @@ class Volume:
         base_residual: Root mean square by which the outline lies off a fitted plane; None for other bases.
         base_error: That times the area with a surface: volume by which net would change, were the base off by so much
             everywhere. None for other bases, whose error is not known.
+        surface_error: Volume by which net would change, were each height off by its expected error in the same
+            direction: an upper bound. None without `--products precision`.
+        without_precision: Share of the area with a surface whose errors are not known, and not in `surface_error`.
         compared: Area where both dates have a surface; None, as the rest, without a second date.
         changed: Area of it where heights differ by the least detectable difference or more.
         fill_since: Volume by which the surface lies above that of the other date, on the changed area.
@@ -71,6 +75,8 @@ class Volume:
     highest: float
     base_residual: float | None = None
     base_error: float | None = None
+    surface_error: float | None = None
+    without_precision: float | None = None
     compared: float | None = None
     changed: float | None = None
     fill_since: float | None = None
@@ -95,6 +101,7 @@ def measure_volumes(
     sheet: GeoTiffSettings,
     heights: Path,
     other: Path | None,
+    precision: Path | None,
     polygons: Sequence[AreaPolygon],
     settings: VolumeSettings,
 ) -> list[Volume]:
@@ -109,6 +116,7 @@ def measure_volumes(
         sheet: The map.
         heights: The surface model.
         other: That of the other date, on the same cells; None for none.
+        precision: Expected errors of the heights, on the same cells; None where they are not known.
         polygons: What to measure.
         settings: How.
 
@@ -118,27 +126,39 @@ def measure_volumes(
     import rasterio
 
     found = []
-    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), rasterio.open(heights) as model:
-        theirs = None if other is None else rasterio.open(other)
-        try:
-            for at, polygon in enumerate(polygons):
-                found.append(_measured(model, theirs, sheet.grid, polygon, settings))
-                emit(Progress("measuring volumes", at + 1, len(polygons)))
-        finally:
-            if theirs is not None:
-                theirs.close()
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), ExitStack() as files:
+        model, theirs, errors = (
+            None if path is None else files.enter_context(rasterio.open(path)) for path in (heights, other, precision)
+        )
+        for at, polygon in enumerate(polygons):
+            found.append(_measured(HeightRasters(model, theirs, errors), sheet.grid, polygon, settings))
+            emit(Progress("measuring volumes", at + 1, len(polygons)))
     return found
 
 
-def _measured(
-    model: DatasetReader, other: DatasetReader | None, grid: MapGrid, polygon: AreaPolygon, settings: VolumeSettings
-) -> Volume:
+@dataclass(frozen=True)
+class HeightRasters:
+    """Open rasters on the cells of a map.
+
+    Attributes:
+        model: The surface model.
+        other: That of the other date; None for none.
+        errors: Expected errors of the heights; None where they are not known.
+    """
+
+    model: DatasetReader
+    other: DatasetReader | None
+    errors: DatasetReader | None
+
+
+def _measured(rasters: HeightRasters, grid: MapGrid, polygon: AreaPolygon, settings: VolumeSettings) -> Volume:
     """The volumes of one polygon."""
+    model, other = rasters.model, rasters.other
     where, kind = f"polygon {polygon.name!r}", settings.base
     outline = outline_heights(model, grid, polygon)
     base = base_of(where, kind, outline)
     pieces = outline_pieces(polygon.rings, grid)
-    total = np.zeros(7)
+    total, uncertain = np.zeros(7), np.zeros(2)
     highest = -np.inf
     for window in _blocks(pieces, grid):
         shares = pieces.shares(window)
@@ -149,6 +169,10 @@ def _measured(
         weight = share[known]
         total[:3] += weight.sum(), weight @ above.clip(min=0), -weight @ above.clip(max=0)
         highest = max(highest, float(above.max(initial=-np.inf)))
+        if rasters.errors is not None:
+            sigma = read_heights(rasters.errors, window).ravel()[inside][known]
+            told = np.isfinite(sigma)
+            uncertain += weight[told].sum(), weight[told] @ sigma[told]
         if other is not None:
             change = ours - read_heights(other, window).ravel()[inside]
             both = np.isfinite(change)
@@ -159,6 +183,7 @@ def _measured(
     covered, fill, cut, compared, changed, fill_since, cut_since = map(float, total * grid.gsd**2)
     if not covered:
         raise BadInput(f"{where}: the map has no surface in it; move it, or delete it from the file")
+    sure, error = map(float, uncertain * grid.gsd**2)
     missing = max(0.0, 1 - covered / polygon.shape.area)
     if missing >= TOLD_MISSING:
         emit(Warned(f"{where}: {missing:.1%} of it has no surface, and counts neither as fill nor as cut"))
@@ -166,6 +191,7 @@ def _measured(
         polygon.name, polygon.shape.area, round(missing, 9), kind if isinstance(kind, str) else "height", base.lowest,
         base.highest, round(outline.share, 9), fill, cut, fill - cut, (fill - cut) / covered, highest, base.residual,
         None if base.residual is None else base.residual * covered,
+        *((None, None) if rasters.errors is None else (error, round(max(0.0, 1 - sure / covered), 9))),
         *((None,) * 5 if other is None else (compared, changed, fill_since, cut_since, fill_since - cut_since)),
     )  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Expected errors of heights, against closed forms and against errors that are known."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,36 @@ def test_errors_that_are_drawn_at_random_are_foretold(tmp_path):
     parallax = draw.normal(0, RAY_ERROR_PX, (2, *sigma.shape))
     errors = HEIGHT**2 / (20 * FOCAL) * (parallax[0] - parallax[1])
     assert np.mean(np.abs(errors) < sigma) == pytest.approx(0.683, abs=0.05)
+
+
+def test_volumes_have_the_error_that_the_precision_implies(tmp_path):
+    needs("pyogrio")
+    corners = [
+        [UTM[0] + 8, UTM[1] + 8],
+        [UTM[0] + 12, UTM[1] + 8],
+        [UTM[0] + 12, UTM[1] + 12],
+        [UTM[0] + 8, UTM[1] + 12],
+    ]
+    shape = {"type": "Polygon", "coordinates": [[*corners, corners[0]]]}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+    items = {
+        "type": "FeatureCollection",
+        "crs": crs,
+        "features": [{"type": "Feature", "properties": {}, "geometry": shape}],
+    }
+    (tmp_path / "a.geojson").write_text(json.dumps(items))
+    settings = MapSettings(("precision",), 0.25, volume=tmp_path / "a.geojson", base=90.0)
+    surface = heightfield(hilly, UTM, (UTM[0] + 20, UTM[1] + 20), 81)
+    views, depths = [nadir(-12), nadir(12)], StereoDepths([depth_of(HEIGHT - 3)] * 2, "a")
+    record = make_maps(MeshWithPhotos(surface, FRAME, views), settings, tmp_path / "maps", depths=depths)
+    found = record["volumes"]["polygons"][0]
+    with rasterio.open(tmp_path / "maps/precision.tif") as file:
+        west, _, _, north = file.bounds
+        column, row = round((UTM[0] + 8 - west) / 0.25), round((north - UTM[1] - 12) / 0.25)
+        part = file.read(1, masked=True)[row : row + 16, column : column + 16]
+    assert 0 < part.mask.mean() < 1
+    assert found["surface_error"] == pytest.approx(0.25**2 * part.sum(), rel=1e-5)
+    assert found["without_precision"] == pytest.approx(part.mask.mean())
 
 
 def test_without_depth_maps_there_is_none(tmp_path):

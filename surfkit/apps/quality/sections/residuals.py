@@ -13,8 +13,8 @@ from surfkit.apps.quality.figures import as_map, bounds_about, drawing, finished
 from surfkit.apps.quality.sections.words import fixed, moments
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import mapping, texts, value_at
-from surfkit.apps.sfm.dataset_export import file_name
 from surfkit.apps.sfm.control_list import GroundControlPoint, read_list
+from surfkit.apps.sfm.dataset_export import file_name
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.crs_names import system_of
 
