@@ -1,0 +1,203 @@
+"""Rolling shutters: what is known of the readout time of each lens, and what becomes of a model with it.
+
+The rows of a photograph are seen from different places (`surfkit.apps.sfm.row_adjustment`). Observations are corrected
+before the model is placed on the map; so all that follows, control points too, has cameras with global shutters, at the
+positions of the middle rows. Photographs are corrected when they are undistorted (`surfkit.apps.sfm.row_motion`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.apps.sfm.bundle_adjustment import mean_error
+from surfkit.apps.sfm.camera_motion import Motion, motion_of
+from surfkit.apps.sfm.engine import load_engine
+from surfkit.apps.sfm.georeference import centres_of
+from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.mapping import read_model
+from surfkit.apps.sfm.readout_times import Readout, known_readout
+from surfkit.apps.sfm.row_adjustment import MAX_MS, MIN_MS, RowAdjustment
+from surfkit.apps.sfm.row_motion import RowMotion
+from surfkit.apps.sfm.settings import Settings
+from surfkit.core.check import BadInput
+from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.files import replacing_folder
+
+CACHE_VERSION = "1"
+"""Changes when the same model would be corrected otherwise."""
+MIN_SIGMAS = 8.0
+"""An estimate counts that is so many standard deviations from 0: lenses that are not quite as modelled mimic some."""
+MIN_GAIN = 0.01
+"""And that makes the mean reprojection error smaller by this share."""
+MIN_SPEED_M = 2.0
+"""Cameras whose readout time is not known, and that are slower, m/s, are left alone: people walk."""
+
+
+@dataclass(frozen=True)
+class LensReadout:
+    """What was found out of a lens.
+
+    Attributes:
+        camera: Make and model; None where EXIF does not say.
+        ms: That is used; None for a global shutter, or where it is not known.
+        source: Whence it is known.
+        estimate_ms: By the photographs alone, with its standard deviation; None where they cannot tell.
+    """
+
+    camera: str | None
+    ms: float | None
+    source: str
+    estimate_ms: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """What became of a model.
+
+    Attributes:
+        lenses: By number of the camera.
+        motions: Of each photograph that was corrected, by name.
+        why: Why nothing was corrected; empty where something was.
+        speeds: Whence speeds are known.
+        error_px: Mean reprojection error before and after.
+        shift_px: Median length by which the first row is shifted against the last.
+    """
+
+    lenses: dict[str, LensReadout] = field(default_factory=dict)
+    motions: dict[str, RowMotion] = field(default_factory=dict)
+    why: str = ""
+    speeds: str = ""
+    error_px: tuple[float, float] | None = None
+    shift_px: float | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """For the report."""
+        return {
+            "corrected": len(self.motions),
+            "why_not": self.why or None,
+            "lenses": [asdict(lens) for lens in self.lenses.values()],
+            "speeds": self.speeds or None,
+            "reprojection_error_px": self.error_px and [round(value, 3) for value in self.error_px],
+            "first_to_last_row_px": self.shift_px and round(self.shift_px, 2),
+        }
+
+    def doubts(self) -> list[str]:
+        """What contradicts the photographs, a line for each."""
+        found = []
+        for lens in self.lenses.values():
+            if lens.ms is None or lens.estimate_ms is None or not lens.source:
+                continue
+            estimate, sigma = lens.estimate_ms
+            if abs(estimate - lens.ms) > max(MIN_SIGMAS * sigma, abs(lens.ms) / 4):
+                found.append(
+                    f"the photographs of {lens.camera} fit a readout time of {estimate:.0f} +- {sigma:.1g} ms better "
+                    f"than {lens.ms:g} ms ({lens.source}): give --readout {estimate:.0f} if speeds and times in EXIF "
+                    "are right"
+                )
+        if self.motions and self.error_px is not None and self.error_px[1] > (1 + MIN_GAIN) * self.error_px[0]:
+            found.append(
+                f"the correction of the rolling shutter makes the reprojection error larger, {self.error_px[0]:.2f} to "
+                f"{self.error_px[1]:.2f} px: did the drone stop for each photograph? then give --readout off"
+            )
+        return found
+
+
+def correct_once(
+    model: Any, photos: Mapping[str, Photo], settings: Settings, folder: Path
+) -> tuple[Any, RollingShutter]:
+    """What `correct` gives, from the folder where an earlier call has kept it for the same of all."""
+    if settings.readout == "off":
+        return model, RollingShutter(why="--readout off")
+    cameras = [list(camera.params) for camera in model.cameras.values()], model.num_points3D(), centres_of(model)
+    exif = [(name, photo.exif) for name, photo in sorted(photos.items())]
+    facts = [CACHE_VERSION, settings.readout, settings.seed, cameras, exif]
+    key = hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
+    record = folder / "corrected.json"
+    if record.is_file() and (kept := read_json(record, dict[str, Any])).get("key") == key:
+        found = load(RollingShutter, kept["found"])
+        return (read_model(folder) if found.motions else model), found
+    corrected, found = correct(model, photos, settings)
+    with replacing_folder(folder) as made:
+        if found.motions:
+            corrected.write_binary(made)
+        write_json(made / record.name, {"key": key, "found": found})
+    return corrected, found
+
+
+def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tuple[Any, RollingShutter]:
+    """A model with observations as a global shutter would have made them, adjusted to these; or the model as it is.
+
+    Args:
+        model: pycolmap.Reconstruction, in any coordinates; it is not changed.
+        photos: By name.
+        settings: For the readout time, and the seed.
+
+    Raises:
+        BadInput: A readout time is given, and neither times nor speeds of the photographs are known.
+    """
+    motion = motion_of(centres_of(model), photos)
+    lenses = _lenses(model, photos, settings)
+    known = {number: lens for number, lens in lenses.items() if lens.ms is not None}
+    listed = {str(number): lens for number, lens in lenses.items()}
+    if not motion.velocities:
+        if settings.readout != "auto":
+            raise BadInput(
+                f"--readout {settings.readout:g} needs to know how fast the camera moved: EXIF has no times of the "
+                "photographs; write DateTimeOriginal into them, or give --readout off"
+            )
+        return model, RollingShutter(listed, why="EXIF has no times of the photographs")
+    if not known and (motion.speed is None or motion.speed < MIN_SPEED_M):
+        slow = "no known speed" if motion.speed is None else f"a speed of {motion.speed:.1f} m/s"
+        return model, RollingShutter(listed, why=f"cameras of unknown readout time have {slow}")
+    search = RowAdjustment(model, photos, settings, motion)
+    if search.base is None:
+        return model, RollingShutter(listed, why="the model cannot be adjusted")
+    times = search.estimate(lenses)
+    lenses = {number: _judged(lens, times[number]) for number, lens in lenses.items()}
+    listed = {str(number): lens for number, lens in lenses.items()}
+    chosen = {number: lens.ms / 1000 for number, lens in lenses.items() if lens.ms is not None}
+    if not chosen:
+        return model, RollingShutter(listed, why="the photographs show no rolling shutter")
+    found = search.final(chosen)
+    before = mean_error(load_engine().Reconstruction(search.base))
+    after = None if found is None else mean_error(found)
+    if after is None or (not known and after > (1 - MIN_GAIN) * before):
+        return model, RollingShutter(listed, why="correcting it does not make the photographs agree better")
+    if settings.readout == "auto" and after > (1 + MIN_GAIN) * before:
+        return model, RollingShutter(listed, why="correcting it makes the photographs agree less")
+    motions, shifts = search.motions(found)
+    by_xmp = sum(motion.velocities[name].by_xmp for name in motions)
+    speeds = f"XMP of {by_xmp} photographs, paths of {len(motions) - by_xmp}"
+    return found, RollingShutter(listed, motions, "", speeds, (before, after), float(np.median(shifts)))
+
+
+def _lenses(model: Any, photos: Mapping[str, Photo], settings: Settings) -> dict[int, LensReadout]:
+    """Each lens of a model, with the readout time that is given or known."""
+    found: dict[int, LensReadout] = {}
+    for number in sorted(model.reg_image_ids()):
+        image = model.image(number)
+        photo = photos[image.name]
+        given = Readout(settings.readout, "--readout") if settings.readout not in ("auto", "off") else None  # type: ignore[arg-type]
+        readout = given or known_readout(photo)
+        lens = LensReadout(photo.exif.camera, readout and readout.ms, readout.source if readout else "")
+        found.setdefault(image.camera_id, lens)
+    return found
+
+
+def _judged(lens: LensReadout, time: tuple[float, float] | None) -> LensReadout:
+    """A lens with the estimate of its readout time, (time, standard deviation) in seconds, which counts if no other is
+    known and it is beyond doubt."""
+    if time is None:
+        return lens
+    ms, sigma = (round(1000 * value, 3) for value in time)
+    use = lens.ms
+    if lens.ms is None and MIN_MS <= abs(ms) <= MAX_MS and abs(ms) > MIN_SIGMAS * sigma:
+        use = ms
+    source = lens.source or ("estimated from the photographs" if use is not None else "")
+    return LensReadout(lens.camera, use, source, (ms, sigma))
