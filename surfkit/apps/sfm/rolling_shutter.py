@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import mean_error
-from surfkit.apps.sfm.camera_motion import Motion, motion_of
+from surfkit.apps.sfm.camera_motion import motion_of
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.georeference import centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
@@ -158,7 +158,7 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     search = RowAdjustment(model, photos, settings, motion)
     if search.base is None:
         return model, RollingShutter(listed, why="the model cannot be adjusted")
-    times = search.estimate(lenses)
+    times = search.estimate({number: lens.ms for number, lens in lenses.items()})
     lenses = {number: _judged(lens, times[number]) for number, lens in lenses.items()}
     listed = {str(number): lens for number, lens in lenses.items()}
     chosen = {number: lens.ms / 1000 for number, lens in lenses.items() if lens.ms is not None}

@@ -58,14 +58,18 @@ class RowAdjustment:
         self.seen = {number: _observed(model, number) for number in sorted(model.reg_image_ids())}
         self.changes: dict[str, np.ndarray] = {}
         self.times: dict[int, float] = {}
-        self.base = adjust(model, None, photos, settings)
+        self.base = self.near = adjust(model, None, photos, settings)
 
-    def estimate(self, lenses: Mapping[int, LensReadout]) -> dict[int, tuple[float, float] | None]:
-        """The readout time of each lens by the photographs alone, and its standard deviation, seconds."""
-        times = {number: (FIRST_MS if lens.ms is None else lens.ms) / 1000 for number, lens in lenses.items()}
-        model, found = self.base, dict.fromkeys(lenses)
-        first = self._slopes(model)
-        for _ in range(1 if all(lens.ms is not None for lens in lenses.values()) else 2):
+    def estimate(self, known: Mapping[int, float | None]) -> dict[int, tuple[float, float] | None]:
+        """The readout time of each lens by the photographs alone, and its standard deviation, seconds.
+
+        Args:
+            known: Milliseconds that are known, by number of the camera.
+        """
+        times = {number: (FIRST_MS if ms is None else ms) / 1000 for number, ms in known.items()}
+        found: dict[int, tuple[float, float] | None] = dict.fromkeys(known)
+        model, first = self.base, self._slopes(self.base)
+        for _ in range(2 if None in known.values() else 1):
             moved = self._adjusted(model, times)
             if moved is None:
                 return found
@@ -76,15 +80,15 @@ class RowAdjustment:
                 if bend > 0:
                     best = times[number] - slope / bend
                     found[number] = best, sigma / float(np.sqrt(bend))
-                    if lenses[number].ms is None and MIN_MS <= abs(1000 * best) <= MAX_MS:
+                    if known[number] is None and MIN_MS <= abs(1000 * best) <= MAX_MS:
                         times[number] = best
-        self.start = model
+        self.near = model
         return found
 
     def final(self, times: Mapping[int, float]) -> Any | None:
         """The model with these readout times, seconds, and motions of each photograph near those; None where it does
         not fit."""
-        model = self._adjusted(self.start if hasattr(self, "start") else self.base, times)
+        model = self._adjusted(self.near, times)
         for _ in range(FINAL_PASSES):
             if model is None:
                 return None
