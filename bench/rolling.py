@@ -2,15 +2,15 @@
 
     python bench/rolling.py FOLDER
 
-Only what cameras see is simulated, by the exact mesh: no photographs. Six strips 120 m above the streets, a photograph each
-2.3 s at 10 m/s, of 4000 x 2666 px (3.5 cm on the ground); the readout takes 30 ms. The speed varies by 20 %. With a
-"fixed heading" photographs are taken in the turns too, and rows point the same way in all of them; else the drone turns
-with the strips. Tie points have a noise of 0.3 px, positions one of 1.5 m (3 m in height) or of 2 cm (RTK). EXIF has a focal
-length that is 2 % off.
+Only what cameras see is simulated, by the exact mesh: no photographs. Six strips 120 m above the streets, a photograph
+each 2.3 s at 10 m/s, of 4000 x 2666 px (3.5 cm on the ground); the readout takes 30 ms. The speed varies by 20 %. With
+a "fixed heading" photographs are taken in the turns too, and rows point the same way in all of them; else the drone
+turns with the strips. Tie points have a noise of 0.3 px, positions one of 1.5 m (3 m in height) or of 2 cm (RTK). EXIF
+has a focal length that is 2 % off.
 
-Structure from motion begins with poses that are 0.2 degrees and 0.5 m off, and adjusts without knowing of the shutter. Judged
-are the mean reprojection error, and the distance of points and cameras from the truth on the map, and after the best
-similarity (shape). Results go to bench/results/rolling.json.
+Structure from motion begins with poses that are 0.2 degrees and 0.5 m off, and adjusts without knowing of the shutter.
+Judged are the mean reprojection error, and the distance of points and cameras from the truth on the map, and after the
+best similarity (shape). Results go to bench/results/rolling.json.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def flight(city: City, path: Path3D, fixed: bool) -> list[Shot]:
 
 
 def coarse_depths(corners: np.ndarray) -> np.ndarray:
-    """(h, w) depths of (3 F, 3) corners of triangles in a camera's frame, without distortion; infinite where none is."""
+    """(h, w) depths of (3 F, 3) corners of triangles in a camera's frame; infinite where none is."""
     triangles = corners.reshape(-1, 3, 3)
     triangles = triangles[(triangles[:, :, 2] > 1).all(1)]
     pixels = (LENS[0] * triangles[:, :, :2] / triangles[:, :, 2:] + LENS[1:3]) / COARSE
@@ -160,8 +160,10 @@ def projected(ray: np.ndarray) -> np.ndarray:
     return LENS[0] * flat * (1 + LENS[3] * (flat**2).sum(1, keepdims=True)) + LENS[1:3]
 
 
-def reconstructed(shots: list[Shot], path: Path3D, ties: np.ndarray, readout: float, seed: int) -> tuple[Any, list[int]]:
-    """The flight as structure from motion finds it, which knows nothing of the shutter; and the tie point of each point."""
+def reconstructed(
+    shots: list[Shot], path: Path3D, ties: np.ndarray, readout: float, seed: int
+) -> tuple[Any, list[int]]:
+    """The flight as structure from motion finds it without knowing of the shutter; and the tie point of each point."""
     engine, rng = load_engine(), np.random.default_rng(seed)
     model, config = engine.Reconstruction(), engine.BundleAdjustmentConfig()
     params = [LENS[0] * EXIF_ERROR, SIZE[0] / 2, SIZE[1] / 2, 0.0]
@@ -217,7 +219,9 @@ def photographs(shots: list[Shot], path: Path3D, kind: str, clock: str, seed: in
     return found
 
 
-def judged(model: Any, of: list[int], ties: np.ndarray, shots: list[Shot], path: Path3D, photos: dict[str, Photo]) -> dict:
+def judged(
+    model: Any, of: list[int], ties: np.ndarray, shots: list[Shot], path: Path3D, photos: dict[str, Photo]
+) -> dict:
     """Figures of a model that is then placed and adjusted to the positions."""
     model.update_point_3d_errors()
     given = np.array([photo.exif.position for photo in photos.values()], np.float64)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import mean_error
 from surfkit.apps.sfm.camera_motion import motion_of
+from surfkit.apps.sfm.control_list import GroundControl
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.georeference import centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
@@ -177,16 +178,31 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     return found, RollingShutter(listed, motions, "", speeds, (before, after), float(np.median(shifts)))
 
 
+def still(ground: GroundControl, model: Any, rolling: RollingShutter) -> GroundControl:
+    """Ground control points whose marks are where the middle rows of photographs would have seen them; `model` is the
+    corrected pycolmap.Reconstruction."""
+    cameras = {image.name: image.camera for image in model.images.values()}
+    points = []
+    for point in ground.points:
+        marks = dict(point.marks)
+        for name, motion in rolling.motions.items():
+            if name in marks:
+                x, y = motion.seen_at_once(np.array([marks[name]]), cameras[name])[0]
+                marks[name] = float(x), float(y)
+        points.append(replace(point, marks=marks))
+    return replace(ground, points=points) if rolling.motions else ground
+
+
 def _lenses(model: Any, photos: Mapping[str, Photo], settings: Settings) -> dict[int, LensReadout]:
     """Each lens of a model, with the readout time that is given or known."""
+    given = None if isinstance(settings.readout, str) else Readout(settings.readout, "--readout")
     found: dict[int, LensReadout] = {}
     for number in sorted(model.reg_image_ids()):
         image = model.image(number)
         photo = photos[image.name]
-        given = Readout(settings.readout, "--readout") if settings.readout not in ("auto", "off") else None  # type: ignore[arg-type]
         readout = given or known_readout(photo)
-        lens = LensReadout(photo.exif.camera, readout and readout.ms, readout.source if readout else "")
-        found.setdefault(image.camera_id, lens)
+        ms, source = (None, "") if readout is None else (readout.ms, readout.source)
+        found.setdefault(image.camera_id, LensReadout(photo.exif.camera, ms, source))
     return found
 
 
