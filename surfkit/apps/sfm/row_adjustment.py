@@ -32,6 +32,8 @@ FIRST_MS = 30.0
 """A readout time to begin with where none is known."""
 MIN_MS, MAX_MS = 5.0, 200.0
 """An estimate of less is that of a shutter as good as global; no camera takes longer."""
+SECANTS = 2
+"""Steps to the readout time that fits best."""
 PASSES, FINAL_PASSES = 2, 3
 """Adjustments for one readout time, and with motions of each photograph."""
 OUTLIER_SIGMAS = 4.0
@@ -74,7 +76,7 @@ class RowAdjustment:
         before = dict.fromkeys(known, 0.0)
         found: dict[int, tuple[float, float] | None] = dict.fromkeys(known)
         model, slopes = self.base, self._slopes(self.base)
-        for _ in range(2 if None in known.values() else 1):
+        for _ in range(SECANTS):
             moved = self._adjusted(model, times)
             if moved is None:
                 return found
@@ -86,7 +88,7 @@ class RowAdjustment:
                 if bend > 0:
                     best = times[number] - slope / bend
                     found[number] = best, sigma / float(np.sqrt(bend))
-                    if known[number] is None and MIN_MS <= abs(1000 * best) <= MAX_MS:
+                    if MIN_MS <= abs(1000 * best) <= MAX_MS:
                         times[number] = best
         self.near = model
         return found

@@ -1,5 +1,6 @@
 """Rolling shutters: a simulated flight whose rows have poses of their own, against the same with a global shutter."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -90,7 +91,7 @@ def test_the_correction_comes_to_what_a_global_shutter_comes_to(rolled, readout)
     assert after < ideal + 0.02
     assert shape_error(flight, found) < 1.2 * shape_error(flight, whole) + 0.02 < shape_error(flight, model)
     [lens] = what.lenses.values()
-    assert lens.estimate_ms[0] == pytest.approx(1000 * READOUT_S, rel=0.04)
+    assert lens.estimate_ms[0] == pytest.approx(1000 * READOUT_S, rel=0.04 if readout == "auto" else 0.1)
     assert lens.source == ("--readout" if readout != "auto" else "estimated from the photographs")
     assert not what.doubts() and set(what.motions) == set(flight.names)
     speed = np.array(what.motions[flight.names[4]].share) * 60 / READOUT_S
@@ -129,7 +130,7 @@ def test_what_was_corrected_is_kept(rolled, tmp_path, monkeypatch):
 def test_a_wrong_readout_time_is_told(rolled):
     _, photos, model = rolled
     [doubt, *_] = correct(model, photos, Settings(readout=40.0))[1].doubts()
-    assert "better than 40 ms" in doubt and "--readout 9" in doubt or "--readout 10" in doubt
+    assert re.search(r"of MADE BY US fit a readout time of (9|10)\d \+- \d ms better than 40 ms \(--readout\)", doubt)
 
 
 def test_photographs_without_times(rolled):
@@ -138,11 +139,7 @@ def test_photographs_without_times(rolled):
     with pytest.raises(BadInput, match="--readout 30 needs to know how fast the camera moved: EXIF has no times"):
         correct(model, timeless, Settings(readout=30.0))
     assert correct(model, timeless, Settings())[0] is model
-    slow = {
-        name: replace(photo, exif=replace(photo.exif, taken=photo.exif.taken.replace(":01 ", ":01 ")))
-        for name, photo in photos.items()
-    }
-    nowhere = {name: replace(photo, exif=replace(photo.exif, position=None)) for name, photo in slow.items()}
+    nowhere = {name: replace(photo, exif=replace(photo.exif, position=None)) for name, photo in photos.items()}
     assert correct(model, nowhere, Settings())[1].why == "cameras of unknown readout time have no known speed"
 
 
