@@ -8,9 +8,9 @@ a "fixed heading" photographs are taken in the turns too, and rows point the sam
 turns with the strips. Tie points have a noise of 0.3 px, positions one of 1.5 m (3 m in height) or of 2 cm (RTK). EXIF
 has a focal length that is 2 % off.
 
-Structure from motion begins with poses that are 0.2 degrees and 0.5 m off and the focal length of EXIF, and
-knows nothing of the shutter. Judged are the mean reprojection error, and the distance of points and cameras from the truth on the map, and after the
-best similarity (shape). Results go to bench/results/rolling.json.
+Structure from motion begins with poses that are 0.2 degrees and 0.5 m off and with the focal length of EXIF, and knows
+nothing of the shutter. Judged are the mean reprojection error, and the distance of points and cameras from the truth on
+the map, and after the best similarity (shape). Results go to bench/results/rolling.json.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.scene.earth import from_utm
 
-SIZE, LENS = (4000, 2666), np.array([3440.0, 2010.0, 1325.0, -0.06])
-"""SIMPLE_RADIAL: focal length and principal point, pixels, and the radial term."""
+SIZE, LENS = (4000, 2666), np.array([3440.0, 2000.0, 1333.0, -0.06])
+"""SIMPLE_RADIAL: focal length, principal point in the middle, as COLMAP takes it, and the radial term."""
 COARSE = 8
 """Depth maps, which tell what is hidden, are so many times smaller."""
 ABOVE_M, SPEED_M, READOUT_S, EACH_S = 120.0, 10.0, 0.03, 2.3

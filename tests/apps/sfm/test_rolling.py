@@ -1,25 +1,30 @@
 """Rolling shutters: a simulated flight whose rows have poses of their own, against the same with a global shutter."""
 
+import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from surfkit.apps.sfm.camera_motion import motion_of, seconds
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint
 from surfkit.apps.sfm.dataset_export import undistorted
 from surfkit.apps.sfm.engine import load_engine
-from surfkit.apps.sfm.exif import Exif, facts
+from surfkit.apps.sfm.exif import TAKEN_TAG, Exif, facts
 from surfkit.apps.sfm.georeference import MapProjection, centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.readout_times import known_readout
 from surfkit.apps.sfm.rolling_shutter import LensReadout, RollingShutter, correct, correct_once, still
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
+from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.scene.earth import from_utm
+from surfkit.testing.write_exif import write_exif
 from tests.apps.sfm.flight import FOCAL, HEIGHT, WIDTH, Flight, reconstructed
+from tests.apps.sfm.pictures import looking, picture, save
 
 READOUT_S, EACH_S = 0.1, 1.5
 """A long readout, as the photographs are small: 8 m/s are 3 px from the first row to the last."""
@@ -214,3 +219,43 @@ def test_a_photograph_becomes_that_of_a_global_shutter():
     assert np.abs(left - wanted).mean() > 4
     back = motion.seen_at_once(motion.sources(np.array([[0.3, -0.2], [-0.4, 0.3]]), camera), camera)
     assert back == pytest.approx(camera.img_from_cam(np.array([[0.3, -0.2, 1], [-0.4, 0.3, 1]])), abs=1e-3)
+
+
+def moved_right(picture, other, top):
+    """By how many pixels a band of 30 rows of a picture is to the right of that of another, by least squares."""
+    shifts = np.arange(-6, 7)
+    middle = np.arange(20, 210)
+    costs = [((picture[top : top + 30, middle + s] - other[top : top + 30, middle]) ** 2).mean() for s in shifts]
+    best = int(np.clip(np.argmin(costs), 1, len(shifts) - 2))
+    before, here, after = costs[best - 1 : best + 2]
+    return shifts[best] + 0.5 * (before - after) / (before - 2 * here + after)
+
+
+def test_prepared_photographs_are_those_of_global_shutters(tmp_path):
+    names = [f"{number}.jpg" for number in range(7)]
+    angles = 0.16 * np.arange(7)
+    poses = [looking((15 * np.cos(a), 15 * np.sin(a), 11)) for a in angles]
+    root, still_pictures = tmp_path / "photos", {}
+    for number, (name, pose, angle) in enumerate(zip(names, poses, angles, strict=True)):
+        motion = 0.3 * np.array([-np.sin(angle), np.cos(angle), 0])  # 2.4 m/s for 125 ms: 4 px
+        still_pictures[name] = picture(pose)
+        taken = f"2024:05:01 12:00:{10 + number:02}"
+        write_exif(save(root / name, picture(pose, motion=motion)), camera={TAKEN_TAG: taken})
+
+    def prepared(readout):
+        scene = tmp_path / f"scene {readout}"
+        given = ["--max-features", "1500", "--readout", readout, "--out", str(scene)]
+        assert main(["prepare", "photos", str(root), *given]) == 0
+        shears = []
+        for name in names:
+            made = np.asarray(Image.open(scene / "images" / name).convert("L"), np.float64)
+            wanted = still_pictures[name][..., 0].astype(np.float64)
+            shears.append(abs(moved_right(made, wanted, 30) - moved_right(made, wanted, 120)))
+        return json.loads((scene / "report.json").read_text())["models"][0]["rolling_shutter"], np.mean(shears)
+
+    plain, left = prepared("off")
+    assert plain["corrected"] == 0 and plain["why_not"] == "--readout off"
+    facts, made = prepared("125")
+    assert facts["corrected"] == 7 and 3 < facts["first_to_last_row_px"] < 5
+    assert facts["lenses"][0]["ms"] == 125 and facts["lenses"][0]["source"] == "--readout"
+    assert left > 1.7 and made < 0.4, "of 2.3 px between two bands, half the height apart"
