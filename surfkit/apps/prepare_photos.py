@@ -223,7 +223,9 @@ def rolling_rows(rolling: dict[str, Any]) -> list[tuple[str, str]]:
     lenses = [lens for lens in rolling["lenses"] if lens["ms"] is not None]
     times = "; ".join(f"{lens['ms']:.3g} ms ({lens['source']})" for lens in lenses)
     before, after = rolling["reprojection_error_px"]
-    shift = f"{rolling['first_to_last_row_px']:.1f} px from the first row to the last"
+    shift = (
+        f"{rolling['corrected']} photographs, {rolling['first_to_last_row_px']:.1f} px from the first row to the last"
+    )
     return [
         ("rolling shutter", f"{times}, {shift}; reprojection error {before:.2f} px without it, {after:.2f} with it")
     ]

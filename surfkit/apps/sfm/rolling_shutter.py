@@ -8,7 +8,7 @@ positions of the middle rows. Photographs are corrected when they are undistorte
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import mean_error
-from surfkit.apps.sfm.camera_motion import motion_of
+from surfkit.apps.sfm.camera_motion import MAX_GAP_S, motion_of, seconds
 from surfkit.apps.sfm.control_list import GroundControl
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.georeference import centres_of
@@ -149,10 +149,11 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     if not motion.velocities:
         if settings.readout != "auto":
             raise BadInput(
-                f"--readout {settings.readout:g} needs to know how fast the camera moved: EXIF has no times of the "
-                "photographs; write DateTimeOriginal into them, or give --readout off"
+                f"--readout {settings.readout:g} needs to know how fast the camera moved, and no two photographs were "
+                f"taken within {MAX_GAP_S:g} s of each other; give --readout off"
             )
-        return model, RollingShutter(listed, why="EXIF has no times of the photographs")
+        why = f"no two photographs were taken within {MAX_GAP_S:g} s of each other, by the times in EXIF"
+        return model, RollingShutter(listed, why=why)
     if not known and (motion.speed is None or motion.speed < MIN_SPEED_M):
         slow = "no known speed" if motion.speed is None else f"a speed of {motion.speed:.1f} m/s"
         return model, RollingShutter(listed, why=f"cameras of unknown readout time have {slow}")
@@ -174,6 +175,15 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     by_xmp = sum(motion.velocities[name].by_xmp for name in motions)
     speeds = f"XMP of {by_xmp} photographs, paths of {len(motions) - by_xmp}"
     return found, RollingShutter(listed, motions, "", speeds, (before, after), float(np.median(shifts)))
+
+
+def refuse_timeless(photos: Sequence[Photo], settings: Settings) -> None:
+    """BadInput if a readout time is given, and EXIF has no times, by which speeds would be known."""
+    if not isinstance(settings.readout, str) and not any(seconds(photo.exif.taken) for photo in photos):
+        raise BadInput(
+            f"--readout {settings.readout:g} needs to know how fast the camera moved, and EXIF has no times of the "
+            "photographs; write DateTimeOriginal into them, or give --readout off"
+        )
 
 
 def still(ground: GroundControl, model: Any, rolling: RollingShutter) -> GroundControl:

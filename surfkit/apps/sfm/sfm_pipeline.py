@@ -28,7 +28,7 @@ from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, map_photographs, read_mod
 from surfkit.apps.sfm.mask_export import deliver_masks
 from surfkit.apps.sfm.match_photos import compare
 from surfkit.apps.sfm.positions import Positions, settle
-from surfkit.apps.sfm.rolling_shutter import RollingShutter, correct_once, still
+from surfkit.apps.sfm.rolling_shutter import RollingShutter, correct_once, refuse_timeless, still
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
 from surfkit.apps.sfm.sfm_report import draw, model_facts, reasons
@@ -86,6 +86,7 @@ class SfmPreparation:
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
         self.refuse(usable)
+        refuse_timeless(usable, self.settings)
         positions = settle(usable, sources.root, self.settings) if self.settings.gps else Positions(usable)
         usable, site = positions.photos, self._site(positions)
         found = compare(stages, usable, sources, self.work, self.settings, self.device)

@@ -16,7 +16,7 @@ from surfkit.apps.sfm.exif import TAKEN_TAG, Exif, facts
 from surfkit.apps.sfm.georeference import MapProjection, centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.readout_times import known_readout
-from surfkit.apps.sfm.rolling_shutter import LensReadout, RollingShutter, correct, correct_once, still
+from surfkit.apps.sfm.rolling_shutter import LensReadout, RollingShutter, correct, correct_once, refuse_timeless, still
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
 from surfkit.cli import main
@@ -141,9 +141,15 @@ def test_a_wrong_readout_time_is_told(rolled):
 def test_photographs_without_times(rolled):
     _, photos, model = rolled
     timeless = {name: replace(photo, exif=replace(photo.exif, taken=None)) for name, photo in photos.items()}
-    with pytest.raises(BadInput, match="--readout 30 needs to know how fast the camera moved: EXIF has no times"):
+    with pytest.raises(
+        BadInput, match="--readout 30 needs to know .*, and EXIF has no times of the photographs; write"
+    ):
+        refuse_timeless(list(timeless.values()), Settings(readout=30.0))
+    refuse_timeless(list(photos.values()), Settings(readout=30.0))
+    with pytest.raises(BadInput, match="--readout 30 needs to know .* no two photographs were taken within 15 s"):
         correct(model, timeless, Settings(readout=30.0))
-    assert correct(model, timeless, Settings())[0] is model
+    found, what = correct(model, timeless, Settings())
+    assert found is model and what.why.startswith("no two photographs")
     nowhere = {name: replace(photo, exif=replace(photo.exif, position=None)) for name, photo in photos.items()}
     assert correct(model, nowhere, Settings())[1].why == "cameras of unknown readout time have no known speed"
 
