@@ -56,6 +56,7 @@ WAYS: tuple[tuple[str, float, str, Any], ...] = (
     ("readout given, whole seconds", READOUT_S, "whole", 1000 * READOUT_S),
     ("readout given, XMP speeds", READOUT_S, "XMP", 1000 * READOUT_S),
     ("readout estimated, exact times", READOUT_S, "exact", "auto"),
+    ("readout estimated, whole seconds", READOUT_S, "whole", "auto"),
     ("global shutter, readout estimated", 0.0, "exact", "auto"),
 )
 """What is flown, how the times of photographs are known, and --readout."""

@@ -23,7 +23,7 @@ from surfkit.apps.sfm.georeference import centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.mapping import read_model
 from surfkit.apps.sfm.readout_times import Readout, known_readout
-from surfkit.apps.sfm.row_adjustment import MAX_MS, MIN_MS, RowAdjustment
+from surfkit.apps.sfm.row_adjustment import MAX_MS, MIN_MS, Estimate, RowAdjustment
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
 from surfkit.core.check import BadInput
@@ -34,8 +34,10 @@ CACHE_VERSION = "1"
 """Changes when the same model would be corrected otherwise."""
 MIN_SIGMAS = 8.0
 """An estimate counts that is so many standard deviations from 0: lenses that are not quite as modelled mimic some."""
+DOUBT_SIGMAS = 3.0
+"""From so many standard deviations on, speeds taken for what they are, an estimate contradicts a known readout time."""
 MIN_GAIN = 0.01
-"""And that makes the mean reprojection error smaller by this share."""
+"""An estimate counts that makes the mean reprojection error smaller by this share."""
 MIN_SPEED_M = 2.0
 """Cameras whose readout time is not known, and that are slower, m/s, are left alone: people walk."""
 
@@ -95,7 +97,7 @@ class RollingShutter:
             if lens.ms is None or lens.estimate_ms is None or not lens.source:
                 continue
             estimate, sigma = lens.estimate_ms
-            if abs(estimate - lens.ms) > max(MIN_SIGMAS * sigma, abs(lens.ms) / 4):
+            if abs(estimate - lens.ms) > max(DOUBT_SIGMAS * sigma, abs(lens.ms) / 4):
                 found.append(
                     f"the photographs of {lens.camera} fit a readout time of {estimate:.0f} +- {sigma:.1g} ms better "
                     f"than {lens.ms:g} ms ({lens.source}): give --readout {estimate:.0f} if speeds and times in EXIF "
@@ -214,14 +216,12 @@ def _lenses(model: Any, photos: Mapping[str, Photo], settings: Settings) -> dict
     return found
 
 
-def _judged(lens: LensReadout, time: tuple[float, float] | None) -> LensReadout:
-    """A lens with the estimate of its readout time, (time, standard deviation) in seconds, which counts if no other is
-    known and it is beyond doubt."""
-    if time is None:
+def _judged(lens: LensReadout, found: Estimate | None) -> LensReadout:
+    """A lens with the estimate of its readout time, which counts if no other is known and it is beyond doubt: errors of
+    speeds make it smaller, and less than all of the motion is better than nothing."""
+    if found is None:
         return lens
-    ms, sigma = (round(1000 * value, 3) for value in time)
-    use = lens.ms
-    if lens.ms is None and MIN_MS <= abs(ms) <= MAX_MS and abs(ms) > MIN_SIGMAS * sigma:
-        use = ms
-    source = lens.source or ("estimated from the photographs" if use is not None else "")
-    return LensReadout(lens.camera, use, source, (ms, sigma))
+    ms, use, source = round(1000 * found.time, 3), lens.ms, lens.source
+    if use is None and MIN_MS <= abs(ms) <= MAX_MS and abs(found.time) > MIN_SIGMAS * found.sigma:
+        use, source = ms, "estimated from the photographs"
+    return LensReadout(lens.camera, use, source, (ms, round(1000 * found.total, 3)))

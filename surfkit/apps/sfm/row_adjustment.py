@@ -43,6 +43,22 @@ ACROSS_SHARE = 0.2
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """A readout time by the photographs alone, seconds.
+
+    Attributes:
+        time: That fits best.
+        sigma: Its standard deviation, if speeds are exact.
+        total: The same with errors of the speeds. Where rows of all photographs point the same way along the path,
+            only differences of the speeds tell the readout time, and errors of these make it too small.
+    """
+
+    time: float
+    sigma: float
+    total: float
+
+
+@dataclass(frozen=True)
 class _Seen:
     """Observations of a photograph: pixels in the file, whose points they are, and the share of the height."""
 
@@ -66,28 +82,29 @@ class RowAdjustment:
         self.base = self.near = model if alone is None else alone
         self.motion = motion_of(centres_of(self.base), photos)
 
-    def estimate(self, known: Mapping[int, float | None]) -> dict[int, tuple[float, float] | None]:
-        """The readout time of each lens by the photographs alone, and its standard deviation, seconds.
+    def estimate(self, known: Mapping[int, float | None]) -> dict[int, Estimate | None]:
+        """The readout time of each lens by the photographs alone.
 
         Args:
             known: Milliseconds that are known, by number of the camera.
         """
         times = {number: (FIRST_MS if ms is None else ms) / 1000 for number, ms in known.items()}
         before = dict.fromkeys(known, 0.0)
-        found: dict[int, tuple[float, float] | None] = dict.fromkeys(known)
+        found: dict[int, Estimate | None] = dict.fromkeys(known)
         model, slopes = self.base, self._slopes(self.base)
         for _ in range(SECANTS):
             moved = self._adjusted(model, times)
             if moved is None:
                 return found
             first, model, slopes = slopes, moved, self._slopes(moved)
-            for number, (slope, sigma) in slopes.items():
+            for number, (slope, sigma, noise) in slopes.items():
                 step = times[number] - before[number]
                 bend = (slope - first[number][0]) / step if step else 0.0
                 before[number] = times[number]
                 if bend > 0:
                     best = times[number] - slope / bend
-                    found[number] = best, sigma / float(np.sqrt(bend))
+                    formal = sigma / math.sqrt(bend)
+                    found[number] = Estimate(best, formal, math.hypot(formal, best * min(1.0, noise / bend)))
                     if MIN_MS <= abs(1000 * best) <= MAX_MS:
                         times[number] = best
         self.near = model
@@ -146,21 +163,31 @@ class RowAdjustment:
                 return None
         return model
 
-    def _slopes(self, model: Any) -> dict[int, tuple[float, float]]:
-        """For each lens, the derivative of half the sum of squares by its readout time, and the standard deviation of a
-        coordinate of its residuals."""
+    def _slopes(self, model: Any) -> dict[int, tuple[float, float, float]]:
+        """For each lens, the derivative of half the sum of squares by its readout time, the standard deviation of a
+        coordinate of its residuals, and what errors of speeds add to the second derivative: of these, poses take up a
+        part, but points do not, as each photograph has its own."""
         slopes: dict[int, float] = {}
+        noises: dict[int, float] = {}
         squares: dict[int, list[np.ndarray]] = {}
         small = 1e-3
         for number, seen in self.seen.items():
             velocity = self.motion.velocities.get(seen.name)
-            left, _ = _residuals(model, number, seen)
+            left, local = _residuals(model, number, seen)
             squares.setdefault(seen.camera, []).append((left**2).ravel())
             slopes.setdefault(seen.camera, 0.0)
             if velocity is not None:
                 slope = _shift(model, number, seen, velocity.vector * small) / small
                 slopes[seen.camera] += float(np.nansum(left * slope))
-        return {at: (slope, float(np.sqrt(np.nanmean(np.concatenate(squares[at]))))) for at, slope in slopes.items()}
+                good = local[:, 2] > 0
+                pose, motion = _derivatives(local[good], seen.share[good], model.cameras[seen.camera])
+                axes = np.linalg.qr(pose)[0]
+                free = motion[:, :2] - axes @ (axes.T @ motion[:, :2])
+                noises[seen.camera] = noises.get(seen.camera, 0.0) + velocity.sigma**2 * float((free**2).sum())
+        return {
+            at: (slope, float(np.sqrt(np.nanmean(np.concatenate(squares[at])))), noises.get(at, 0.0))
+            for at, slope in slopes.items()
+        }
 
     def _fit_motions(self, model: Any) -> None:
         """Change the motion of each photograph, together with its pose, to what its residuals say."""
@@ -201,6 +228,18 @@ def _fitted(
         sigma: That of an observation.
         camera: pycolmap's; its distortion is left out here.
     """
+    columns = np.concatenate(_derivatives(local, share, camera), 1) / sigma
+    prior = np.zeros(9)
+    prior[6:] = 1 / np.maximum(trust, 1e-12)
+    scale = np.linalg.norm(columns, axis=0) + prior
+    matrix = np.vstack([columns, np.diag(prior)]) / scale
+    right = np.concatenate([left.ravel() / sigma, np.zeros(6), -before * prior[6:]])
+    return (np.linalg.lstsq(matrix, right, rcond=1e-9)[0] / scale)[6:]
+
+
+def _derivatives(local: np.ndarray, share: np.ndarray, camera: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(2 K, 6) derivatives of pixels by a small turn and a move of a camera, and (2 K, 3) by its motion during the
+    readout; arguments as for `_fitted`."""
     x, y, z = local.T
     zero = np.zeros_like(z)
     by_place = np.stack([np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)], 1)
@@ -208,13 +247,8 @@ def _fitted(
     cross = np.stack(
         [np.stack([zero, z, -y], 1), np.stack([-z, zero, x], 1), np.stack([y, -x, zero], 1)], 1
     )  # of a small turn w: w x p = cross @ w
-    columns = np.concatenate([by_place @ cross, by_place, -share[:, None, None] * by_place], 2).reshape(-1, 9) / sigma
-    prior = np.zeros(9)
-    prior[6:] = 1 / np.maximum(trust, 1e-12)
-    scale = np.linalg.norm(columns, axis=0) + prior
-    matrix = np.vstack([columns, np.diag(prior)]) / scale
-    right = np.concatenate([left.ravel() / sigma, np.zeros(6), -before * prior[6:]])
-    return (np.linalg.lstsq(matrix, right, rcond=1e-9)[0] / scale)[6:]
+    pose = np.concatenate([by_place @ cross, by_place], 2).reshape(-1, 6)
+    return pose, (-share[:, None, None] * by_place).reshape(-1, 3)
 
 
 def _observed(model: Any, number: int) -> _Seen:
