@@ -116,6 +116,16 @@ def test_a_global_shutter_is_left_alone(tmp_path):
     assert abs(what.lenses["1"].estimate_ms[0]) < 5
 
 
+def test_a_drone_of_known_readout_time_that_stops_is_left_alone():
+    flight, photos = flown(0.0)  # as it stops for each photograph, all rows see from one place
+    model = reconstructed(flight)
+    known = {name: replace(photo, exif=replace(photo.exif, camera="DJI FC220")) for name, photo in photos.items()}
+    found, what = correct(model, known, Settings())
+    assert found is model and what.why == "correcting it makes the photographs agree less"
+    _, what = correct(model, photos, Settings(readout=64.0))
+    assert any("did the drone stop for each photograph" in doubt for doubt in what.doubts())
+
+
 def test_off_returns_the_model_as_it_is(rolled, tmp_path):
     _, photos, model = rolled
     found, what = correct_once(model, photos, Settings(readout="off"), tmp_path / "rolling")
