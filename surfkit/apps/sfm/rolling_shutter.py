@@ -154,7 +154,7 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
                 f"--readout {settings.readout:g} needs to know how fast the camera moved, and no two photographs were "
                 f"taken within {MAX_GAP_S:g} s of each other; give --readout off"
             )
-        why = f"no two photographs were taken within {MAX_GAP_S:g} s of each other, by the times in EXIF"
+        why = f"EXIF has no times of photographs within {MAX_GAP_S:g} s of each other"
         return model, RollingShutter(listed, why=why)
     if not known and (motion.speed is None or motion.speed < MIN_SPEED_M):
         slow = "no known speed" if motion.speed is None else f"a speed of {motion.speed:.1f} m/s"
