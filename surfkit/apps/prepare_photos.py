@@ -216,6 +216,21 @@ def _view(photo: Photo, width: int, height: int) -> View:
     return View(photo.name, camera, Path(photo.name))
 
 
+def rolling_rows(rolling: dict[str, Any]) -> list[tuple[str, str]]:
+    """What is told of rolling shutters; nothing where none was found or given."""
+    if not rolling["corrected"]:
+        return [("rolling shutter", f"not corrected: {rolling['why_not']}")] if rolling["lenses"] else []
+    lenses = [lens for lens in rolling["lenses"] if lens["ms"] is not None]
+    times = "; ".join(f"{lens['ms']:.3g} ms ({lens['source']})" for lens in lenses)
+    before, after = rolling["reprojection_error_px"]
+    shift = (
+        f"{rolling['corrected']} photographs, {rolling['first_to_last_row_px']:.1f} px from the first row to the last"
+    )
+    return [
+        ("rolling shutter", f"{times}, {shift}; reprojection error {before:.2f} px without it, {after:.2f} with it")
+    ]
+
+
 def show(report: dict[str, Any], scene: Path) -> None:
     """Print what was found, what was not, and where it lies."""
     models = report["models"]
@@ -228,6 +243,7 @@ def show(report: dict[str, Any], scene: Path) -> None:
     exif = "none in EXIF" if lens["exif"] is None else f"{lens['exif']:.0f} px in EXIF"
     said = f"{exif}, {lens['photographs_alone']:.0f} by the photographs alone, {lens['final']:.0f} in the end{more}"
     rows.append(("focal length", f"{said}; heights are {heights:.2f} times those by the photographs alone"))
+    rows += rolling_rows(first["rolling_shutter"])
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))

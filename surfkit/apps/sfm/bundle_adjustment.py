@@ -46,7 +46,13 @@ def adjust_once(
     return found
 
 
-def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo], settings: Settings) -> Any | None:
+def adjust(
+    model: Any,
+    placement: Placement | None,
+    photos: Mapping[str, Photo],
+    settings: Settings,
+    max_error_ratio: float = MAX_ERROR_RATIO,
+) -> Any | None:
     """A reconstruction adjusted to EXIF and positions; None where it does not converge, or fits the photographs worse.
 
     Args:
@@ -54,6 +60,7 @@ def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo],
         placement: The positions, and which of them agree; None without.
         photos: By name.
         settings: For the seed.
+        max_error_ratio: How many times larger the mean reprojection error may become.
     """
     engine = load_engine()
     new = engine.Reconstruction(model)
@@ -75,7 +82,7 @@ def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo],
     summary = run("adjusting cameras", solve)
     found = taken_over(engine, model, new)
     before, after = mean_error(engine.Reconstruction(model)), mean_error(found)
-    return found if summary.is_solution_usable() and after <= MAX_ERROR_RATIO * before else None
+    return found if summary.is_solution_usable() and after <= max_error_ratio * before else None
 
 
 def _priors(engine: Any, model: Any, placement: Placement) -> list[Any]:

@@ -17,6 +17,7 @@ from PIL import Image
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.mapping import read_model
+from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.sources import Sources
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
@@ -58,6 +59,7 @@ def deliver(
     sources: Sources,
     scene: Path,
     work: Path,
+    motions: Mapping[str, RowMotion] | None = None,
 ) -> None:
     """Write SCENE/images and SCENE/sparse/0, 1, ...; photographs that are there already are not written again.
 
@@ -67,13 +69,15 @@ def deliver(
         sources: Where the photographs are.
         scene: The data set.
         work: Folder for the record of what was written.
+        motions: Of cameras during the readout of photographs, by their names; they are taken out.
     """
+    motions = motions or {}
     try:
         before = read_json(work / UNDISTORTED_RECORD, dict[str, str])
     except BadInput:
         before = {}
     lenses = [(image.name, model.cameras[image.camera_id]) for model, _ in models for image in _images(model)]
-    wanted = {file_name(name): _key(photos[name], camera) for name, camera in lenses}
+    wanted = {file_name(name): _key(photos[name], camera, motions.get(name)) for name, camera in lenses}
     if any(before.get(name) != key for name, key in wanted.items()):
         before = {name: key if wanted.get(name, key) == key else "" for name, key in before.items()}
         write_json(work / UNDISTORTED_RECORD, before)  # what a kill leaves half replaced counts as neither
@@ -88,11 +92,12 @@ def deliver(
         with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_PHOTO_THREADS)) as pool:
 
             def undistort(image: Any, model: Any = model) -> UndistortedImage:
-                key = _key(photos[image.name], model.cameras[image.camera_id])
+                motion = motions.get(image.name)
+                key = _key(photos[image.name], model.cameras[image.camera_id], motion)
                 name = file_name(image.name)
                 source = sources.path(image.name)
                 reading = photos[image.name].reading
-                made = _write(source, reading, scene / "images" / name, model, image, before.get(name) == key)
+                made = _write(source, reading, scene / "images" / name, model, image, motion, before.get(name) == key)
                 kept[name] = key
                 return made
 
@@ -161,8 +166,9 @@ def file_name(name: str) -> str:
     return name if Path(name).suffix.lower() in (".jpg", ".jpeg", ".png") else f"{name}.png"
 
 
-def _key(photo: Photo, camera: Any) -> str:
+def _key(photo: Photo, camera: Any, motion: RowMotion | None) -> str:
     said = f"{CACHE_VERSION} {JPEG_QUALITY} {photo.digest} {camera.model.name} {np.round(camera.params, 7).tolist()}"
+    said += f" {motion}" if motion is not None else ""
     return hashlib.sha256(said.encode()).hexdigest()[:24]
 
 
@@ -175,16 +181,25 @@ def _pinhole(camera: Any) -> Any:
         raise BadInput(f"the lens that was found cannot be undistorted: {said}; choose another with --lens") from error
 
 
-def _write(source: Path, reading: Pixels, target: Path, model: Any, image: Any, there: bool) -> UndistortedImage:
-    """Write an undistorted photograph unless it is there, and look at it where its features are."""
+def undistorted(pixels: np.ndarray, camera: Any, motion: RowMotion | None) -> np.ndarray:
+    """(H, W, 3) uint8 of the pinhole camera of a lens, of a photograph (h, w, 3) uint8, whose rows are seen at once."""
+    if motion is not None:
+        return motion.straightened(pixels, camera, _pinhole(camera))
     engine = load_engine()
+    bitmap = engine.Bitmap.from_array(np.ascontiguousarray(pixels))
+    return np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
+
+
+def _write(
+    source: Path, reading: Pixels, target: Path, model: Any, image: Any, motion: RowMotion | None, there: bool
+) -> UndistortedImage:
+    """Write an undistorted photograph unless it is there, and look at it where its features are."""
     camera = model.cameras[image.camera_id]
     bent = np.array([spot.xy for spot in image.get_observation_points2D()], np.float64).reshape(-1, 2)
     pinhole = _pinhole(camera)
     if not (there and target.is_file()):
         pixels = read_photo(source, (camera.width, camera.height), pixels=reading).permute(1, 2, 0).numpy()
-        bitmap = engine.Bitmap.from_array(np.ascontiguousarray(pixels))
-        straight = np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
+        straight = undistorted(pixels, camera, motion)
         with replacing(target) as file:
             if target.suffix.lower() == ".png":
                 Image.fromarray(straight).save(file, "PNG", compress_level=1)

@@ -38,6 +38,8 @@ LIKELY_FOCAL_RANGE = (0.1, 10.0)
 """Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
 MAX_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
+MAX_SPEED_M = 100.0
+"""No drone that takes photographs is faster, m/s."""
 ABOVE_REFERENCES, BELOW_REFERENCES = (0, 2), (1, 3)
 """References of altitudes, see `_zero`."""
 SEA_LEVEL_REFERENCES = (2, 3)
@@ -70,6 +72,7 @@ class Exif:
         xmp_altitude: Altitude in XMP, metres, also where XMP has no position.
         above_start: Height above the place of the start in XMP, metres.
         accuracy_m: Standard deviations east, north and up, metres, of a receiver that states them (RTK).
+        speed: Of the drone when it was taken, m/s, by XMP.
     """
 
     camera: str | None = None
@@ -85,6 +88,7 @@ class Exif:
     xmp_altitude: float | None = None
     above_start: float | None = None
     accuracy_m: tuple[float, float, float] | None = None
+    speed: float | None = None
 
     @property
     def which(self) -> str | None:
@@ -134,6 +138,7 @@ def facts(
         xmp_altitude=xmp.get(xmp_names.ALTITUDE),
         above_start=xmp.get(xmp_names.ABOVE_START),
         accuracy_m=_accuracy(gps, xmp),
+        speed=_speed(xmp),
     )
 
 
@@ -230,6 +235,14 @@ def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, 
         if all(0 < value < MAX_ERROR_M for value in found):
             return found  # type: ignore[return-value]
     return None
+
+
+def _speed(xmp: Mapping[str, float]) -> float | None:
+    """Of DJI's three speeds, whose axes are north, east and height; which way these count does not matter here."""
+    parts = [xmp.get(name) for name in ("FlightXSpeed", "FlightYSpeed", "FlightZSpeed")]
+    given = [part for part in parts if part is not None]
+    found = math.hypot(*given) if len(given) == len(parts) else math.inf
+    return found if found <= MAX_SPEED_M else None
 
 
 def _number(value: Any, negative: bool = False) -> float | None:

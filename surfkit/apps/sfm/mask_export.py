@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from surfkit.apps.sfm.dataset_export import MAX_PHOTO_THREADS, file_name
-from surfkit.apps.sfm.engine import load_engine
+from surfkit.apps.sfm.dataset_export import MAX_PHOTO_THREADS, file_name, undistorted
 from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.sources import Sources
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
@@ -28,7 +28,12 @@ MASKS_RECORD = "masks.json"
 
 
 def deliver_masks(
-    models: Sequence[Any], photos: Mapping[str, Photo], sources: Sources, scene: Path, work: Path
+    models: Sequence[Any],
+    photos: Mapping[str, Photo],
+    sources: Sources,
+    scene: Path,
+    work: Path,
+    motions: Mapping[str, RowMotion] | None = None,
 ) -> None:
     """Write SCENE/masks, and delete there what an earlier call wrote and belongs to no photograph any more.
 
@@ -38,10 +43,12 @@ def deliver_masks(
         sources: Where the masks are.
         scene: The data set.
         work: Folder for the record of what was written.
+        motions: As for `deliver`.
 
     Raises:
         BadInput: A mask of somebody else would be replaced.
     """
+    motions = motions or {}
     try:
         before = read_json(work / MASKS_RECORD, dict[str, str])
     except BadInput:
@@ -52,6 +59,7 @@ def deliver_masks(
             if photos[image.name].mask:
                 camera = model.cameras[image.camera_id]
                 said = f"{CACHE_VERSION} {photos[image.name].mask} {camera.model.name} {list(camera.params)}"
+                said += f" {motions[image.name]}" if image.name in motions else ""
                 key = hashlib.sha256(said.encode()).hexdigest()[:24]
                 wanted[f"{file_name(image.name)}.png"] = key, image.name, camera
     folder = scene / MASKS_FOLDER
@@ -61,18 +69,21 @@ def deliver_masks(
         return
     todo = {name: each for name, each in wanted.items() if before.get(name) != each[0] or not (folder / name).is_file()}
     write_json(work / MASKS_RECORD, before | dict.fromkeys(todo, ""))  # what a kill leaves is ours, and made again
+
+    def write(target: str) -> None:
+        _, name, camera = todo[target]
+        _write(sources, name, folder / target, camera, motions.get(name))
+
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_PHOTO_THREADS)) as pool:
-        list(pool.map(lambda name: _write(sources, todo[name][1], folder / name, todo[name][2]), todo))
+        list(pool.map(write, todo))
     for name in set(before) - set(wanted):
         delete_with_folders(folder / name, scene)
     write_json(work / MASKS_RECORD, {name: key for name, (key, _, _) in wanted.items()})
 
 
-def _write(sources: Sources, name: str, target: Path, camera: Any) -> None:
+def _write(sources: Sources, name: str, target: Path, camera: Any, motion: RowMotion | None) -> None:
     """A mask as the pinhole camera would have it; what the photograph does not show is black."""
-    engine = load_engine()
     seen = sources.read_mask(name, (camera.width, camera.height)).astype(np.uint8) * 255
-    bitmap = engine.Bitmap.from_array(np.ascontiguousarray(np.repeat(seen[..., None], 3, 2)))
-    straight = np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
+    straight = undistorted(np.repeat(seen[..., None], 3, 2), camera, motion)
     with replacing(target) as file:
         Image.fromarray(np.where(straight[..., 0] > 127, 255, 0).astype(np.uint8)).save(file, "PNG")

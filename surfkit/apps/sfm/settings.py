@@ -14,6 +14,8 @@ from surfkit.scene.pixels import Alpha
 
 WORK_FOLDER, REPORT_FILE = "prepare", "report.json"
 """Folder of the data set for what the stages keep, and what is told of it at the end."""
+READOUT_RANGE_MS = (1.0, 500.0)
+"""Readout times that a camera may have."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,11 @@ class Settings:
     lens: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"] = "SIMPLE_RADIAL"
     """COLMAP's model of the lens: one or two radial terms, radial and tangential terms, more of both, or a fisheye.
     Photographs of equal camera, size and focal length share a lens."""
+
+    readout: float | Literal["auto", "off"] = "auto"
+    """How long the camera reads a photograph, milliseconds from the first row to the last: the motion in that time is
+    taken out. `auto` knows some drones, and estimates others from the photographs if they flew; `off` takes all rows
+    as exposed at once."""
 
     mapper: Literal["incremental", "global"] = "incremental"
     """How cameras are placed: one after the other, or all at once, which is faster for thousands of photographs and
@@ -110,6 +117,11 @@ class Settings:
         require_within({"frame_step": (0.005, 0.5)}, self)
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
         require_within({"gcp_sigma": (0.001, 100.0), "mark_sigma": (0.05, 100.0)}, self)
+        if not isinstance(self.readout, str) and not READOUT_RANGE_MS[0] <= abs(self.readout) <= READOUT_RANGE_MS[1]:
+            raise BadInput(
+                f"--readout {self.readout:g}: milliseconds from the first row to the last, {READOUT_RANGE_MS[0]:g} to "
+                f"{READOUT_RANGE_MS[1]:g}, less than 0 where the last row is read first; or auto, or off"
+            )
         if self.gcp_sigma_up is not None:
             require_within({"gcp_sigma_up": (0.001, 100.0)}, self)
         if self.checkpoint_names and self.gcp is None:

@@ -28,6 +28,8 @@ from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, map_photographs, read_mod
 from surfkit.apps.sfm.mask_export import deliver_masks
 from surfkit.apps.sfm.match_photos import compare
 from surfkit.apps.sfm.positions import Positions, settle
+from surfkit.apps.sfm.rolling_shutter import RollingShutter, correct_once, refuse_timeless, still
+from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import REPORT_FILE, WORK_FOLDER, Settings
 from surfkit.apps.sfm.sfm_report import draw, model_facts, reasons
 from surfkit.apps.sfm.sources import Sources, look_at_all
@@ -43,6 +45,9 @@ from surfkit.scene.crs import EGM96
 CAMERAS_PICTURE = "cameras.png"
 SOURCE_FILE = "source.txt"
 """In the work folder: the folder that the photographs are from. They may change there, as when all are saved anew."""
+
+PlacedModel = tuple[Any, Placement | ControlResiduals | None, Weighed, RollingShutter]
+"""pycolmap.Reconstruction, where it lies, and what became of focal lengths, heights and shutters."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,7 @@ class SfmPreparation:
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
         self.refuse(usable)
+        refuse_timeless(usable, self.settings)
         positions = settle(usable, sources.root, self.settings) if self.settings.gps else Positions(usable)
         usable, site = positions.photos, self._site(positions)
         found = compare(stages, usable, sources, self.work, self.settings, self.device)
@@ -91,15 +97,16 @@ class SfmPreparation:
             raise BadInput(self._no_model(photos, reasons(photos, found.counts, matches, [])))
         placed = stages.run("georeference", "", lambda: self._place(models, positions, site))
         by_name = {photo.name: photo for photo in usable}
-        done = [(model, None if where is None else _placed(where, self.settings.crs)) for model, where, _ in placed]
-        stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources))
-        first, where, _ = placed[0]
+        done = [(model, None if where is None else _placed(where, self.settings.crs)) for model, where, *_ in placed]
+        motions = {name: motion for *_, rolling in reversed(placed) for name, motion in rolling.motions.items()}
+        stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources, motions))
+        first, where, *_ = placed[0]
         points, listed = (
             where if isinstance(where, ControlResiduals) else None,
             site if isinstance(site, GroundControl) else None,
         )
         write_tables(self.scene, first, points, listed)
-        names = [set(centres_of(model)) for model, _, _ in placed]
+        names = [set(centres_of(model)) for model, *_ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
     def _look(self) -> tuple[Sources, list[Photo]]:
@@ -121,11 +128,15 @@ class SfmPreparation:
         return sources, photos
 
     def _deliver(
-        self, models: Sequence[tuple[Any, Georeference | None]], photos: dict[str, Photo], sources: Sources
+        self,
+        models: Sequence[tuple[Any, Georeference | None]],
+        photos: dict[str, Photo],
+        sources: Sources,
+        motions: dict[str, RowMotion],
     ) -> None:
         """Write photographs, masks and models of the data set."""
-        deliver_masks([model for model, _ in models], photos, sources, self.scene, self.work)
-        deliver(models, photos, sources, self.scene, self.work)
+        deliver_masks([model for model, _ in models], photos, sources, self.scene, self.work, motions)
+        deliver(models, photos, sources, self.scene, self.work, motions)
 
     def _refuse_few(self, photos: Sequence[Photo], usable: Sequence[Photo]) -> None:
         if len(usable) >= MIN_MODEL_PHOTOS:
@@ -169,11 +180,18 @@ class SfmPreparation:
 
     def _place(
         self, models: Sequence[Path], positions: Positions, site: GroundControl | list[PositionHypothesis]
-    ) -> list[tuple[Any, Placement | ControlResiduals | None, Weighed]]:
-        """The models, each on the map or level, and what became of their focal lengths and heights."""
+    ) -> list[PlacedModel]:
+        """The models, each on the map or level, and what became of their focal lengths, heights and shutters."""
         photos = {photo.name: photo for photo in positions.photos}
         alone = [read_model(path) for path in models]
-        loaded = [self._with_exif(number, model, photos) for number, model in enumerate(alone)]
+        loaded, shutters = [], []
+        for number, model in enumerate(alone):
+            folder = self.work / "rolling" / str(number)
+            found = correct_once(self._with_exif(number, model, photos), photos, self.settings, folder)
+            loaded.append(found[0])
+            shutters.append(found[1])
+            for doubt in found[1].doubts():
+                emit(Warned(f"sparse/{number}: {doubt}"))
         chosen: GroundControl | PositionHypothesis | NoSimilarity
         if isinstance(site, GroundControl):
             chosen = site
@@ -182,9 +200,10 @@ class SfmPreparation:
         else:
             chosen = NoSimilarity("no photograph has a position in EXIF or XMP" if self.settings.gps else "--no-gps")
         placed = []
-        for number, (before, model) in enumerate(zip(alone, loaded, strict=True)):
-            final, where, stretch = self._place_one(number, model, chosen, photos)
-            placed.append((final, where, weighed(before, final, photos, stretch)))
+        for number, (before, model, rolling) in enumerate(zip(alone, loaded, shutters, strict=True)):
+            own = still(chosen, model, rolling) if isinstance(chosen, GroundControl) else chosen
+            final, where, stretch = self._place_one(number, model, own, photos)
+            placed.append((final, where, weighed(before, final, photos, stretch), rolling))
         for doubt in placed[0][2].doubts():  # of the others, which have the same lenses mostly, the report says it
             emit(Warned(f"sparse/0: {doubt}"))
         return placed
@@ -274,14 +293,17 @@ class SfmPreparation:
         self,
         stages: StageFolder,
         photos: Sequence[Photo],
-        placed: Sequence[tuple[Any, Placement | ControlResiduals | None, Weighed]],
+        placed: Sequence[PlacedModel],
         why: dict[str, str],
     ) -> dict[str, Any]:
         report = {
             "photographs": len(photos),
             "registered": placed[0][0].num_reg_images(),
             "not_registered": why,
-            "models": [model_facts(model, where) | {"weighed": moved.facts()} for model, where, moved in placed],
+            "models": [
+                model_facts(model, where) | {"weighed": moved.facts(), "rolling_shutter": rolling.facts()}
+                for model, where, moved, rolling in placed
+            ],
             "seconds": stages.seconds(),
             "settings": self.settings,
         }

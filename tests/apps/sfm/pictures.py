@@ -35,14 +35,15 @@ def arc(count, start=0.0, step=0.16):
     ]
 
 
-def picture(pose, seed=0, width=WIDTH, height=HEIGHT):
-    """(H, W, 3) uint8 of the scene with the texture of `seed`."""
+def picture(pose, seed=0, width=WIDTH, height=HEIGHT, motion=(0.0, 0.0, 0.0)):
+    """(H, W, 3) uint8 of the scene with the texture of `seed`; the camera moves by `motion` from the first row to the
+    last."""
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3]
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    origins = np.broadcast_to(eye, rays.shape)
+    origins = eye + (y.reshape(-1, 1) / height) * np.asarray(motion)
     depth = np.min([surface.hit(origins, rays)[0] for surface in SURFACES], axis=0)
-    points = eye + np.where(np.isfinite(depth), depth, 0)[:, None] * rays
+    points = origins + np.where(np.isfinite(depth), depth, 0)[:, None] * rays
     lattice = np.random.default_rng(seed).uniform(-1, 1, (48, 48, 48))
     value = sum(
         weight * map_coordinates(lattice, (points * scale).T % 48, order=1, mode="grid-wrap")

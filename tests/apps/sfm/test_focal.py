@@ -37,7 +37,7 @@ def placed(flight, focal_px, folder, sigma=(2.0, 2.0, 4.0), stated=None):
     ]
     preparation, given = SfmPreparation(folder, folder / "scene", Settings()), Positions(photos)
     with collect_notes():
-        [(model, _, found)] = preparation._place([folder / "model"], given, readings(given, "auto"))
+        [(model, _, found, _)] = preparation._place([folder / "model"], given, readings(given, "auto"))
     return alone, model, found
 
 
