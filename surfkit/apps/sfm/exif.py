@@ -34,6 +34,10 @@ UNIT_MM = {2: 25.4, 3: 10.0}
 """Of the focal plane's resolution: inch, centimetre."""
 DIAGONAL35_MM = math.hypot(36, 24)
 """Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
+WIDE_ASPECT, SMALL_SENSOR_FACTOR = 1.7, 3.5
+"""From this aspect ratio on, a photograph is taken for a crop of the sensor, whose diagonal the equivalent focal length
+is of: cameras keep it when they are set to 16:9. Sensors of 1/1.7 inch and less, which shorten it more than so many
+times, are 4:3, larger ones 3:2."""
 LIKELY_FOCAL_RANGE = (0.1, 10.0)
 """Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
 MAX_ERROR_M = 1e4
@@ -63,6 +67,7 @@ class Exif:
         taken: Time, "2024:05:01 12:00:00.25", which sorts by time.
         orientation: 1 to 8, as EXIF numbers them; 1 is upright.
         focal_px: Focal length in pixels of the longer side's direction, at the size of the file.
+        is_focal_held: Whether it was decided that the photographs have no say in it.
         position: Where it was taken, in EXIF; the altitude is as the file gives it.
         unsigned: Which of latitude and longitude have no letter of the hemisphere, so that their sign is not known; the
             position has them as positive.
@@ -80,6 +85,7 @@ class Exif:
     serial: str | None = None
     orientation: int = 1
     focal_px: float | None = None
+    is_focal_held: bool = False
     position: Position | None = None
     unsigned: tuple[str, ...] = ()
     no_reference: bool = False
@@ -149,8 +155,10 @@ def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
 
 def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     focal, equivalent = _number(tags.get(FOCAL_MM_TAG)), _number(tags.get(FOCAL35_MM_TAG))
-    if equivalent and _is_likely(found := equivalent / DIAGONAL35_MM * math.hypot(*size), size):
-        return found
+    if equivalent:
+        found = equivalent / DIAGONAL35_MM * _sensor_diagonal(size, equivalent / focal if focal else None)
+        if _is_likely(found, size):
+            return found
     density, unit = _number(tags.get(PER_UNIT_X_TAG)), UNIT_MM.get(tags.get(UNIT_TAG, 2))
     width = _number(tags.get(PIXELS_X_TAG))
     if not (focal and density and unit and width):
@@ -158,6 +166,14 @@ def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     sensor_mm = width / density * unit  # of the direction that was the width when the photograph was taken
     found = focal / sensor_mm * max(size)
     return found if _is_likely(found, size) else None
+
+
+def _sensor_diagonal(size: tuple[int, int], factor: float | None) -> float:
+    """Diagonal of the sensor in pixels of a photograph; `factor` is the ratio of equivalent and real focal length."""
+    longer, shorter = max(size), min(size)
+    if longer >= WIDE_ASPECT * shorter and factor is not None:
+        shorter = round(longer * (3 / 4 if factor > SMALL_SENSOR_FACTOR else 2 / 3))
+    return math.hypot(longer, shorter)
 
 
 def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,10 @@ from surfkit.apps.sfm.inspect_photos import Photo
 
 EXIF_FOCAL_SIGMA = 0.03
 """Standard deviation of the focal length of EXIF, as a share: it is rounded, and lenses differ by some percent."""
+HELD_FOCAL_SIGMA = 0.001
+"""The same where photographs, which cannot tell it, contradict it. Photographs that all look the same way put errors of
+other kinds, such as those of a lens with more terms, into the focal length, by tens of per cent and more than their own
+standard deviation says; and heights above the ground are as wrong as it is."""
 PHOTOGRAMMETRIC_FOCAL_SIGMA = 0.1
 """That of the focal length by photographs alone, where EXIF has none and positions are weighed against it."""
 CONTRADICTION_SIGMAS = 3.0
@@ -30,6 +34,8 @@ MIN_HEIGHT_SPREAD = 0.02
 the focal length: bundle adjustment bends a model by up to a tenth of it."""
 SAMPLED_CAMERAS = 100
 """Cameras that tell how far away the ground is."""
+MAX_START_RATIO = 0.15
+"""Share by which heights above the ground and above the start may differ without a word."""
 MAX_PARALLEL_SINE = 0.06
 """Root mean square of the sines between the axes of photographs, below which all look the same way."""
 
@@ -43,12 +49,14 @@ class Focal:
         alone: By the photographs alone.
         final: By photographs, EXIF and positions together.
         photographs: That were taken with it.
+        held: Whether that in EXIF was held.
     """
 
     exif: float | None
     alone: float
     final: float
     photographs: int
+    held: bool = False
 
     @property
     def contradicts(self) -> bool:
@@ -59,6 +67,8 @@ class Focal:
         """
         if self.exif is None:
             return False
+        if self.held:
+            return True
         alone, final = self.alone / self.exif - 1, self.final / self.exif - 1
         return (
             alone * final > (CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA) ** 2
@@ -94,7 +104,16 @@ def known_focals(model: Any, photos: Mapping[str, Photo], alone: bool) -> dict[i
         for number, camera in model.cameras.items()
         if alone
     }
-    return own | {number: (focal, EXIF_FOCAL_SIGMA) for number, focal in exif_focals(model, photos).items()}
+    held = {model.image(n).camera_id for n in model.reg_image_ids() if photos[model.image(n).name].exif.is_focal_held}
+    return own | {
+        number: (focal, HELD_FOCAL_SIGMA if number in held else EXIF_FOCAL_SIGMA)
+        for number, focal in exif_focals(model, photos).items()
+    }
+
+
+def with_focals_held(photos: Mapping[str, Photo]) -> dict[str, Photo]:
+    """The same photographs, whose focal lengths in EXIF are not to be changed."""
+    return {name: replace(photo, exif=replace(photo.exif, is_focal_held=True)) for name, photo in photos.items()}
 
 
 def add_marks(model: Any, config: Any, focals: Mapping[int, tuple[float, float]]) -> None:
@@ -152,20 +171,32 @@ class Weighed:
         parallel: Whether all photographs look the same way.
         stretch: How many times as much the heights of the positions differ as those of the cameras, and the standard
             deviation of that number; None without positions, or where these cannot tell.
+        above_ground: Median height of the cameras above the ground, metres; None without a scale.
+        above_start: The same above the place of the start, by XMP; None where it does not say.
     """
 
     focals: tuple[Focal, ...]
     heights: float
     parallel: bool
     stretch: tuple[float, float] | None = None
+    above_ground: float | None = None
+    above_start: float | None = None
 
     def facts(self) -> dict[str, Any]:
         """For the report."""
         return {
             "focal_lengths_px": [
-                {"exif": f.exif, "photographs_alone": f.alone, "final": f.final, "photographs": f.photographs}
+                {
+                    "exif": f.exif,
+                    "photographs_alone": f.alone,
+                    "final": f.final,
+                    "photographs": f.photographs,
+                    "held": f.held,
+                }
                 for f in self.focals
             ],
+            "cameras_above_ground_m": self.above_ground and round(self.above_ground, 2),
+            "cameras_above_start_m": self.above_start and round(self.above_start, 2),
             "heights_times": round(self.heights, 3),
             "gps_heights_times": None if self.stretch is None else [round(value, 3) for value in self.stretch],
         }
@@ -182,12 +213,21 @@ class Weighed:
                     "heights with --gcp"
                 )
             if focal.exif is not None and focal.contradicts:
+                why = ", as all photographs look the same way and cannot tell it" if focal.held else ""
                 found.append(
                     f"the focal length in EXIF of {focal.photographs} photographs is {focal.exif:.0f} px, that by the "
                     f"photographs alone {focal.alone:.0f} px ({focal.alone / focal.exif - 1:+.0%}; EXIF is taken to be "
-                    f"within {CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA:.0%}); {focal.final:.0f} px are used. If "
+                    f"within {CONTRADICTION_SIGMAS * EXIF_FOCAL_SIGMA:.0%}); {focal.final:.0f} px are used{why}. If "
                     f"photographs were cropped or EXIF "
                     "is wrong, remove the focal length from EXIF; otherwise try --lens OPENCV"
+                )
+        if self.above_ground is not None and self.above_start is not None and self.parallel:
+            ratio = self.above_ground / max(self.above_start, 1e-9)
+            if abs(ratio - 1) > MAX_START_RATIO:
+                found.append(
+                    f"the cameras are {self.above_ground:.1f} m above the ground, and by XMP {self.above_start:.1f} m "
+                    "above the start: if the ground is as high as the start, the focal length is wrong, and heights "
+                    f"are {ratio:.2f} times what they should be; check them with --gcp"
                 )
         if self.stretch is not None and self.contradicts:
             found.append(
@@ -217,7 +257,13 @@ class Weighed:
         return self.stretch is not None and self.stretch[1] < EXIF_FOCAL_SIGMA
 
 
-def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[float, float] | None) -> Weighed:
+def weighed(
+    alone: Any,
+    final: Any,
+    photos: Mapping[str, Photo],
+    stretch: tuple[float, float] | None,
+    metres: float | None = None,
+) -> Weighed:
     """What became of a model.
 
     Args:
@@ -225,19 +271,27 @@ def weighed(alone: Any, final: Any, photos: Mapping[str, Photo], stretch: tuple[
         final: The same in the end.
         photos: By name.
         stretch: As `height_stretch` gives it.
+        metres: In a unit of the final one; None where it has no scale.
     """
     counts = Counter(final.image(number).camera_id for number in final.reg_image_ids())
     known = exif_focals(final, photos)
     before, after = alone.cameras, final.cameras
+    placed = [final.image(number) for number in final.reg_image_ids()]
+    held = {image.camera_id for image in placed if photos[image.name].exif.is_focal_held}
     focals = [
-        Focal(known.get(at), before[at].mean_focal_length(), after[at].mean_focal_length(), count)
+        Focal(known.get(at), before[at].mean_focal_length(), after[at].mean_focal_length(), count, at in held)
         for at, count in counts.most_common()
     ]
+    starts = [photos[image.name].exif.above_start for image in placed]
+    above = [start for start in starts if start is not None]
     heights = _relative_height(final) / max(_relative_height(alone), 1e-9)
     axes = np.stack([final.image(number).cam_from_world().matrix()[2, :3] for number in final.reg_image_ids()])
     middle = axes.mean(0)
     sines = np.linalg.norm(np.cross(axes, middle / max(np.linalg.norm(middle), 1e-9)), axis=1)
-    return Weighed(tuple(focals), heights, bool(np.sqrt((sines**2).mean()) < MAX_PARALLEL_SINE), stretch)
+    return Weighed(
+        tuple(focals), heights, bool(np.sqrt((sines**2).mean()) < MAX_PARALLEL_SINE), stretch,
+        None if metres is None else metres * height_above_ground(final), float(np.median(above)) if above else None,
+    )  # fmt: skip
 
 
 def height_stretch(

@@ -18,7 +18,14 @@ from surfkit.apps.sfm.control_list import GroundControl, read_ground
 from surfkit.apps.sfm.control_report import warnings_of, write_tables
 from surfkit.apps.sfm.dataset_export import deliver
 from surfkit.apps.sfm.engine import load_engine
-from surfkit.apps.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
+from surfkit.apps.sfm.focal import (
+    Weighed,
+    exif_focals,
+    height_above_ground,
+    height_stretch,
+    weighed,
+    with_focals_held,
+)
 from surfkit.apps.sfm.georeference import NoSimilarity, Placement, centres_of
 from surfkit.apps.sfm.gravity_alignment import points_of, turn_upright, up_of
 from surfkit.apps.sfm.ground_control import ControlResiduals, doubts, place_by_points
@@ -187,7 +194,8 @@ class SfmPreparation:
         loaded, shutters = [], []
         for number, model in enumerate(alone):
             folder = self.work / "rolling" / str(number)
-            found = correct_once(self._with_exif(number, model, photos), photos, self.settings, folder)
+            with_exif, photos = self._with_exif(number, model, photos)
+            found = correct_once(with_exif, photos, self.settings, folder)
             loaded.append(found[0])
             shutters.append(found[1])
             for doubt in found[1].doubts():
@@ -203,7 +211,8 @@ class SfmPreparation:
         for number, (before, model, rolling) in enumerate(zip(alone, loaded, shutters, strict=True)):
             own = still(chosen, model, rolling) if isinstance(chosen, GroundControl) else chosen
             final, where, stretch = self._place_one(number, model, own, photos)
-            placed.append((final, where, weighed(before, final, photos, stretch), rolling))
+            metres = None if where is None else where.chart.metres
+            placed.append((final, where, weighed(before, final, photos, stretch, metres), rolling))
         for doubt in placed[0][2].doubts():  # of the others, which have the same lenses mostly, the report says it
             emit(Warned(f"sparse/0: {doubt}"))
         return placed
@@ -220,7 +229,9 @@ class SfmPreparation:
                 model.transform(_sim3d(where.similarity))
                 return self._adjusted_to_points(number, model, replace(where, wrong_marks=tuple(wrong)), site, photos)
         elif isinstance(site, PositionHypothesis):
+            held = {name for name, photo in photos.items() if photo.exif.is_focal_held}
             photos = {photo.name: photo for photo in site.photos}
+            photos |= with_focals_held({name: photo for name, photo in photos.items() if name in held})
             where = locate(model, site, self.settings.seed)
         else:
             where = site
@@ -266,15 +277,23 @@ class SfmPreparation:
             emit(Warned(f"sparse/{number}: {line}"))
         return found or model, where, None
 
-    def _with_exif(self, number: int, alone: Any, photos: dict[str, Photo]) -> Any:
-        """A copy of the model, adjusted to the focal lengths of EXIF if there are some."""
+    def _with_exif(self, number: int, alone: Any, photos: dict[str, Photo]) -> tuple[Any, dict[str, Photo]]:
+        """A copy of the model, adjusted to the focal lengths of EXIF if there are some; the photographs, those of the
+        model with focal lengths that are held if they cannot tell them, and contradict EXIF."""
         copy = load_engine().Reconstruction(alone)
         if not exif_focals(alone, photos):
-            return copy
+            return copy, photos
         found = adjust_once(copy, None, photos, self.settings, self.work / "weighed" / str(number))
         if found is None:
             emit(Warned(f"sparse/{number}: the focal lengths of EXIF do not fit the photographs and are left out"))
-        return found or copy
+        doubted = weighed(alone, found or copy, photos, None)
+        if doubted.parallel and any(focal.contradicts for focal in doubted.focals):
+            own = {image.name: photos[image.name] for image in map(alone.image, alone.reg_image_ids())}
+            held = photos | with_focals_held(own)
+            firm = adjust_once(copy, None, held, self.settings, self.work / "held" / str(number))
+            if firm is not None:
+                return firm, held
+        return found or copy, photos
 
     def _by_points(
         self, number: int, model: Any, ground: GroundControl, photos: dict[str, Photo]

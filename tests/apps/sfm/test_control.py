@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly, reconstructed
 
 from surfkit.apps.sfm.bundle_adjustment import adjust
 from surfkit.apps.sfm.control_adjustment import adjust_to_points, adjust_to_points_once, clean_marks
@@ -19,8 +20,6 @@ from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.survey_observations import CameraPositions, SurveyedPoint, Weights, adjust_together
 from surfkit.core.check import BadInput
 from surfkit.scene.earth import from_utm
-
-from .flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly, reconstructed
 
 CHART = MapProjection("EPSG:32633", (500_000.0, 5_800_000.0, 0.0))
 SETTINGS = Settings(gcp=Path("gcp_list.txt"), mark_sigma=NOISE_PX, checkpoint_names=("C0", "C1", "C2", "C3"))

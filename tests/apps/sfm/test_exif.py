@@ -62,6 +62,15 @@ def test_camera_time_and_orientation(photo):
     assert (found.camera, found.taken, found.orientation) == ("DJI FC6310", "2024:05:01 12:00:00.25", 6)
 
 
+def test_the_equivalent_focal_length_is_of_the_whole_sensor():
+    """A Phantom 3 (FC300S, 1/2.3 inch, 6.17 mm wide, 3.61 mm) has 20 mm in EXIF at 4:3, and at 16:9 too."""
+    tags = {exif.FOCAL35_MM_TAG: 20, exif.FOCAL_MM_TAG: 3.61}
+    whole, wide = (facts({}, tags, {}, {}, size).focal_px for size in ((4000, 3000), (4000, 2250)))
+    assert whole == wide == pytest.approx(3.61 / 6.17 * 4000, rel=0.02)
+    inch = facts({}, {exif.FOCAL35_MM_TAG: 24, exif.FOCAL_MM_TAG: 8.8}, {}, {}, (5472, 3078)).focal_px
+    assert inch == pytest.approx(8.8 / 13.2 * 5472, rel=0.01)
+
+
 def test_focal_lengths():
     size = (5472, 3648)
     diagonal = facts({}, {exif.FOCAL35_MM_TAG: 24}, {}, {}, size).focal_px

@@ -137,3 +137,16 @@ def test_an_adjustment_leaves_the_model_it_was_given():
     adjust(alone, None, flight.photos(0.9 * FOCAL), Settings())
     assert (alone.cameras[1].params == before.cameras[1].params).all() and len(alone.images) == len(before.images)
     assert all((point.xyz == before.points3D[number].xyz).all() for number, point in alone.points3D.items())
+
+
+def test_where_photographs_cannot_tell_exif_is_held(tmp_path, capsys):
+    """Straight down but for a degree, with a principal point that is not in the middle, as the model has it."""
+    flight = fly(tilt_deg=1.0)
+    flight = replace(flight, seen=[(rows, pixels + 10) for rows, pixels in flight.seen])
+    alone, model, found = placed(flight, FOCAL, tmp_path, sigma=(0.5, 0.5, 1.0))
+    assert abs(focal_of(alone) / FOCAL - 1) > 0.3, "the case is one"
+    assert focal_of(model) == pytest.approx(FOCAL, rel=0.01)
+    assert found.focals[0].held and "as all photographs look the same way and cannot tell it" in capsys.readouterr().err
+    assert found.above_ground == pytest.approx(ALTITUDE, rel=0.05)
+    assert not any("above the start" in line for line in found.doubts())
+    assert any("heights are 1.5" in line for line in replace(found, above_start=found.above_ground / 1.5).doubts())

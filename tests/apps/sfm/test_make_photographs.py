@@ -42,7 +42,7 @@ def test_of_photographs_the_cameras_are_found_first(photos, monkeypatch, capsys)
     assert told["decisions"]["photographs"] == 5 and "could not be forecast" in told["decisions"]["why"]
     assert (photos.parent / "delivery/scene/sparse/0").is_dir()
     said = capsys.readouterr()
-    assert "step 1 of 5: cameras" in said.err and "not known: nothing could be measured" in said.out
+    assert "step 1 of 6: cameras" in said.err and "not known: nothing could be measured" in said.out
     assert make(photos, "--images", "pictures") == 2 and "leave it out" in capsys.readouterr().err
     words = ["make", str(photos), "--out", str(photos / "delivery")]
     assert main(words) == 2 and "name one outside" in capsys.readouterr().err and not (photos / "delivery").exists()

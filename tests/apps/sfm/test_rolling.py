@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flight import FOCAL, HEIGHT, WIDTH, Flight, reconstructed
 from PIL import Image
 
 from surfkit.apps.sfm.camera_motion import motion_of, seconds
@@ -23,7 +24,6 @@ from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.scene.earth import from_utm
 from surfkit.testing.write_exif import write_exif
-from tests.apps.sfm.flight import FOCAL, HEIGHT, WIDTH, Flight, reconstructed
 from tests.apps.sfm.pictures import looking, picture, save
 
 READOUT_S, EACH_S = 0.1, 1.5
