@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from surfkit.apps.maps.map_grid import map_crs
 from surfkit.apps.maps.map_settings import USUAL_PRODUCTS, Product
@@ -69,11 +69,20 @@ def wanted() -> Wanted:
         left_out["maps"] = f"{error}; {INSTALL_LATER}"
         return Wanted(texture, None, left_out, pdf)
     products: list[Product] = []
-    for name in USUAL_PRODUCTS:
+    for name in (*USUAL_PRODUCTS, "precision"):  # which the depth maps tell that each of the recipes makes
         try:
             Maps(products=(name,)).refuse_missing()
         except BadInput as error:
             left_out[name] = f"{error}; {INSTALL_LATER}"
         else:
             products.append(name)
-    return Wanted(texture, Maps(products=tuple(products)), left_out, pdf)
+    maps = Maps(products=tuple(products))
+    if "orthophoto" in products:
+        photographic = replace(maps, colors="photographs")
+        try:
+            photographic.refuse_missing()
+        except BadInput as error:
+            left_out["orthophoto from the photographs"] = f"{error}; {INSTALL_LATER}; it has colours of the mesh"
+        else:
+            maps = photographic
+    return Wanted(texture, maps, left_out, pdf)

@@ -47,6 +47,7 @@ OPENED = {
     "surface model": f"{MAPS}/dsm.tif",
     "orthophoto": f"{MAPS}/orthophoto.tif",
     "hillshade": f"{MAPS}/hillshade.tif",
+    "expected errors of heights": f"{MAPS}/precision.tif",
     "contour lines": f"{MAPS}/contours.gpkg",
     "point cloud": f"{MAPS}/points.copc.laz",
     "splats": f"{RUN}/point_cloud.ply",

@@ -356,10 +356,16 @@ def _name_wrong(where: Placement) -> None:
     wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
     far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
     if len(wrong) == 1:
-        emit(Warned(f"the position of {wrong[0]!r} is {far[0]:.0f} m from where the others put it, and is left out"))
+        by = f"{_metres(far[0])} m"
+        emit(Warned(f"the position of {wrong[0]!r} is {by} from where the others put it, and is left out"))
     elif wrong:
-        by = f"{far.min():.0f} to {far.max():.0f} m"
+        by = " to ".join(dict.fromkeys(_metres(value) for value in (far.min(), far.max()))) + " m"
         emit(Warned(f"{len(wrong)} positions are {by} from where the others put them, and are left out: {few(wrong)}"))
+
+
+def _metres(value: float) -> str:
+    """A distance to 0.1 m, and of 10 m and more to 1 m."""
+    return f"{value:.1f}" if value < 10 else f"{value:,.0f}"
 
 
 def read_drawn(scene: Path) -> Any:

@@ -99,7 +99,7 @@ def _colors(
     with np.errstate(divide="ignore", invalid="ignore"):
         second = (p[:, 0] * across[:, 1] - across[:, 0] * p[:, 1]) / area
         third = (ahead[:, 0] * p[:, 1] - p[:, 0] * ahead[:, 1]) / area
-    shares = np.stack([1 - second - third, second, third], axis=1)
+        shares = np.stack([1 - second - third, second, third], axis=1)  # not finite for a triangle without an area
     shares = np.where(np.isfinite(shares).all(1, keepdims=True), shares, 1 / 3).clip(0, 1)
     value = what.levels.value[what.levels.corner[faces[mine]]]
     return levelled(shown, (value * shares[:, :, None]).sum(1) / shares.sum(1, keepdims=True))
