@@ -23,10 +23,10 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 import programs  # noqa: E402
-import splats as tables  # noqa: E402
+import splat_columns as tables  # noqa: E402
 from machine import save  # noqa: E402
 from programs import Missing  # noqa: E402
-from splats import Bounds, Splats, difference, precision, read_ply, representable  # noqa: E402
+from splat_columns import Bounds, Splats, difference, precision, read_ply, representable  # noqa: E402
 
 from surfkit.core.check import BadInput  # noqa: E402
 from surfkit.io.splats.splat_files import read_splat_file  # noqa: E402

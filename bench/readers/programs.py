@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from splats import Splats, from_columns, made, read_ply, sigmoid, spz_head, to_columns, turned
+from splat_columns import Splats, from_columns, made, read_ply, sigmoid, spz_head, to_columns, turned
 
 HERE = Path(__file__).parent
 MODULES = HERE / "node_modules"
