@@ -22,7 +22,7 @@ from surfkit.apps.quality.report import document_of
 from surfkit.apps.quality.sections.calibration import radial_distortion
 from surfkit.apps.quality.sections.maps_section import covered, surface
 from surfkit.apps.quality.sections.residuals import control
-from surfkit.apps.quality.sections.summary import ground_sampling_distance
+from surfkit.apps.quality.sections.summary import focal_warnings, ground_sampling_distance
 from surfkit.apps.quality.sections.tie_point_section import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
 from surfkit.apps.quality.sparse_model import SparseModel
 from surfkit.apps.quality.survey import open_survey
@@ -203,6 +203,17 @@ def test_a_model_of_other_lenses_is_not_taken_for_the_calibrated_one(survey):
 def test_the_ground_sampling_distance_is_height_by_focal_length(survey):
     nadir = 60 / FOCAL
     assert nadir < ground_sampling_distance(survey) < 1.25 * nadir, "every second one looks 35 degrees off"
+
+
+def test_the_first_page_tells_that_heights_depend_on_exif(survey):
+    lens = {"exif": 2311.2, "photographs_alone": 2842.0, "final": 2323.9, "photographs": 18, "held": True}
+    weighed = {"focal_lengths_px": [lens], "cameras_above_ground_m": 38.9, "cameras_above_start_m": 39.9}
+    for facts, count in ((weighed, 2), (weighed | {"focal_lengths_px": []}, 0),
+                         (weighed | {"focal_lengths_px": [], "cameras_above_start_m": 30.0}, 1)):  # fmt: skip
+        models = [{**survey.prepared["models"][0], "weighed": facts}]
+        said = focal_warnings(replace(survey, prepared={**survey.prepared, "models": models}))
+        assert len(said) == count
+        assert not count or "38.9 m above the ground" in said[-1]
 
 
 def test_control_points_are_listed_with_their_photographs(survey):

@@ -13,6 +13,7 @@ from surfkit.apps.quality.sections.residuals import accuracy_rows
 from surfkit.apps.quality.sections.words import days, fixed, length, share
 from surfkit.apps.quality.survey import Survey
 from surfkit.apps.report.json_values import mapping, number, texts
+from surfkit.apps.sfm.focal import MAX_START_RATIO
 from surfkit.scene.photos import open_header
 
 MAX_ERROR_PX = 1.0
@@ -184,6 +185,7 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
         said.append(f"Control points contradict the others and were left out: {', '.join(left)}.")
     if left := list(mapping(survey.georeference, "left_out")):
         said.append(f"{len(left)} positions of photographs contradict the others and were left out.")
+    said += focal_warnings(survey)
     if found.counts is not None:
         known = found.counts[np.isfinite(found.counts)]
         thin = float((known < 3).mean()) if len(known) else 0.0
@@ -193,4 +195,21 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
         said.append("The run is not finished.")
     elif survey.delivery.get("quality") == "draft":
         said.append(f"This is a draft ({fixed(steps, 0)} steps): the surface is a first look.")
+    return said
+
+
+def focal_warnings(survey: Survey) -> list[str]:
+    """What is known of the focal length from one source only: heights depend on it."""
+    weighed, said = mapping(survey.model_facts, "weighed"), []
+    for lens in weighed.get("focal_lengths_px") or ():
+        if isinstance(lens, dict) and lens.get("held") is True:
+            exif, alone = number(lens, "exif") or 0.0, number(lens, "photographs_alone") or 0.0
+            said.append(
+                "All photographs look the same way, so heights are as exact as the focal length in EXIF "
+                f"({exif:.0f} px), which the photographs alone contradict ({alone:.0f} px). Check heights with control "
+                "points."
+            )
+    ground, start = number(weighed, "cameras_above_ground_m"), number(weighed, "cameras_above_start_m")
+    if ground and start and (said or abs(ground / start - 1) > MAX_START_RATIO):
+        said.append(f"The cameras are {ground:.1f} m above the ground, and by XMP {start:.1f} m above their start.")
     return said
