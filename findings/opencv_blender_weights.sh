@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # OpenCV's multi-band blender darkens a picture whose mask has low weights, to black where it is 1, and calls it valid.
 #
-# OpenCV 4.14.0, `cv2.detail_MultiBandBlender`. Masks act as weights, and OpenCV's own example of stitching feeds soft ones.
+# OpenCV 4.14.0, `cv2.detail_MultiBandBlender`. Masks act as weights, so that soft ones are of use.
 # A good engineer would guess that the sum is divided by the weights, so that a single picture comes back as it is. An even
 # grey of 200 comes back as 199 with a mask of 255, 191 with 16, 127 with 2 and 0 with 1, whatever the number of bands, and
 # with 255 in the mask of the result: pixels are cut to whole numbers after the weight is applied, before they are divided by
-# it. With the distance from the border as weight, in pixels, the first pixel inside is black without bands, and with five
+# it, as it seems. With the distance from the border as weight, in pixels, the first pixel inside is black without bands, and with five
 # the border is 181. The blender of feathers, which takes the same masks, gives 199 everywhere.
 set -euo pipefail
 folder=$(mktemp -d)
