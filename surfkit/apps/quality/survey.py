@@ -33,7 +33,7 @@ from surfkit.scene.up_direction import map_axes, up_direction
 
 DELIVERY_RECORD = "make.json"
 """In the folder of a delivery."""
-CALIBRATED = ("adjusted", "weighed", "models")
+CALIBRATED = ("controlled", "held", "adjusted", "weighed", "rolling", "models")
 """Folders of a prepared scene that may hold the model with the calibrated lenses; the last adjustment first."""
 
 

@@ -124,6 +124,11 @@ class Settings:
             )
         if self.gcp_sigma_up is not None:
             require_within({"gcp_sigma_up": (0.001, 100.0)}, self)
+        if self.gcp is None:
+            for name in ("gcp_sigma", "gcp_sigma_up", "mark_sigma"):
+                if getattr(self, name) != getattr(type(self), name):
+                    option = f"--{name.replace('_', '-')}"
+                    raise BadInput(f"{option} is how exact the points of --gcp FILE are, which is not given")
         if self.checkpoint_names and self.gcp is None:
             raise BadInput("--checkpoint-names holds back points of --gcp FILE, which is not given")
         if self.checkpoint_names and self.checkpoints:

@@ -1,6 +1,7 @@
 """The quality report of a simulated survey: its figures, its HTML and its PDF as others read them."""
 
 import io
+import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -21,7 +22,7 @@ from surfkit.apps.quality.photo_overlap import Ground, ground_of, ground_of_poin
 from surfkit.apps.quality.report import document_of
 from surfkit.apps.quality.sections.calibration import radial_distortion
 from surfkit.apps.quality.sections.maps_section import covered, surface
-from surfkit.apps.quality.sections.residuals import control
+from surfkit.apps.quality.sections.residuals import control, positions
 from surfkit.apps.quality.sections.summary import focal_warnings, ground_sampling_distance
 from surfkit.apps.quality.sections.tie_point_section import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
 from surfkit.apps.quality.sparse_model import SparseModel
@@ -192,6 +193,24 @@ def test_the_lens_is_the_calibrated_one_and_its_curve_that_of_its_formula(survey
     radii, moved = radial_distortion(camera)
     straight = (radii - moved) / FOCAL
     assert np.allclose(radii, FOCAL * straight * (1 + 0.1 * straight**2)) and radii[-1] == 200 and moved[-1] > 5
+
+
+def test_the_model_that_was_adjusted_to_control_points_is_the_calibrated_one(tmp_path):
+    prepared(tmp_path)
+    (tmp_path / "prepare/models").rename(tmp_path / "prepare/controlled")
+    assert open_survey(tmp_path).calibrated == tmp_path / "prepare/controlled/0"
+
+
+def test_positions_that_took_part_beside_control_points_are_told(survey):
+    facts = {"kept": True, "positions": 12, "positions_offset_m": [-0.327, -0.109, 7.812]}
+    for adjustment, words in (
+        ({}, "photographs were not used"),
+        ({**facts, "kept": False}, "photographs were not used"),
+        (facts, "Positions of 12 photographs are part of its adjustment too.*-0.33 -0.11 \\+7.81 m"),
+    ):
+        model = {**survey.model_facts, "ground_control": {**CONTROL, "adjustment": adjustment}}
+        (told,) = texts(positions(replace(survey, prepared={**survey.prepared, "models": [model]})), "missing")
+        assert re.search(words, told), told
 
 
 def test_a_model_of_other_lenses_is_not_taken_for_the_calibrated_one(survey):

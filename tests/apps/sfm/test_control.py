@@ -258,6 +258,9 @@ def test_settings_and_names_that_will_not_do(tmp_path):
         Settings(gcp=Path("x"), mark_sigma=1000)
     with pytest.raises(BadInput, match="--checkpoint-names holds back"):
         Settings(checkpoint_names=("A",))
+    for alone in ({"gcp_sigma": 0.1}, {"gcp_sigma_up": 0.1}, {"mark_sigma": 1.0}):
+        with pytest.raises(BadInput, match="--(gcp-sigma|gcp-sigma-up|mark-sigma) is .* which is not given"):
+            Settings(**alone)
     with pytest.raises(BadInput, match="leave out one of the two"):
         Settings(gcp=Path("x"), checkpoints=1, checkpoint_names=("A",))
     lines = ["EPSG:32633", *(f"{x} {x * x} 3 4 5 {y}.jpg P{x}" for x in range(4) for y in range(2))]

@@ -12,7 +12,7 @@ from surfkit.apps.quality.document import Element, Figure, Paragraph, Section, T
 from surfkit.apps.quality.figures import as_map, bounds_about, drawing, finished, round_length, styled
 from surfkit.apps.quality.sections.words import fixed, moments
 from surfkit.apps.quality.survey import Survey
-from surfkit.apps.report.json_values import mapping, texts, value_at
+from surfkit.apps.report.json_values import mapping, number, texts, value_at
 from surfkit.apps.sfm.control_list import GroundControlPoint, read_list
 from surfkit.apps.sfm.dataset_export import file_name
 from surfkit.core.check import BadInput
@@ -29,13 +29,7 @@ def positions(survey: Survey) -> Section:
     residuals = residual_rows(told)
     elements: list[Element] = []
     if not residuals:
-        why = (
-            "The scene was placed by ground control points; positions of the photographs were not used."
-            if survey.ground_control
-            else "No positions of the photographs are known: surfkit prepare photos takes them from EXIF and XMP, or "
-            "from a file, --positions FILE."
-        )
-        elements.append(Paragraph(why, "missing"))
+        elements.append(Paragraph(_without_residuals(survey), "missing"))
         elements.append(positions_figure(survey, {}, False))
         return Section("Camera positions", tuple(elements))
     left_out = set(mapping(told, "left_out"))
@@ -55,6 +49,28 @@ def positions(survey: Survey) -> Section:
             Table("Positions left out", ("photograph", "distance, m"), listed, "They contradict the others.")
         )
     return Section("Camera positions", tuple(elements))
+
+
+def _without_residuals(survey: Survey) -> str:
+    """Why no residuals of the positions are known."""
+    if not survey.ground_control:
+        return (
+            "No positions of the photographs are known: surfkit prepare photos takes them from EXIF and XMP, or from a "
+            "file, --positions FILE."
+        )
+    adjustment = mapping(survey.ground_control, "adjustment")
+    count = number(adjustment, "positions")
+    if not count or not adjustment.get("kept"):
+        return "The scene was placed by ground control points; positions of the photographs were not used."
+    said = (
+        f"The scene was placed by ground control points. Positions of {count:.0f} photographs are part of its "
+        "adjustment too; their residuals are not kept."
+    )
+    offset = adjustment.get("positions_offset_m")
+    if isinstance(offset, list) and len(offset) == 3:
+        said += f" They differ from the control points by {' '.join(f'{value:+.2f}' for value in offset)} m on average"
+        said += " (east, north, up), which was taken away."
+    return said
 
 
 def residual_rows(told: dict[str, Any]) -> dict[str, np.ndarray]:
