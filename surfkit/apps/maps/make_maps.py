@@ -31,7 +31,7 @@ from surfkit.apps.maps.precision import Rays, StereoDepths, write_precision
 from surfkit.apps.maps.rasters import Raster
 from surfkit.apps.maps.surface_model import SurfaceModelStats, draw_surface, has_colors, needs_double
 from surfkit.apps.maps.terrain import find_ground, write_terrain
-from surfkit.apps.maps.volumes import VolumeSettings, measure_volumes, volumes_record, write_volumes
+from surfkit.apps.maps.volumes import VolumeSettings, measure_volumes, tell_cut_off, volumes_record, write_volumes
 from surfkit.apps.texture.resolution import ground_sampling_distance
 from surfkit.apps.texture.texture_cache import identity, seen
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
@@ -92,6 +92,8 @@ def make_maps(
     polygons = []
     if settings.volume is not None:
         polygons = read_polygons(settings.volume, VOLUME_OPTION, Site("the map", frame.crs, grid.bounds))
+        if grid.area is not None:
+            tell_cut_off(polygons, grid.area, unit_of(frame))
     done, unit = drawable(surface, settings), unit_of(frame)
     from_photographs = "orthophoto" in done and settings.colors == "photographs"
     files = [PRODUCT_FILES[name] for name in (*done, *["sources"] * from_photographs,

@@ -16,10 +16,12 @@ from surfkit.apps.maps.cell_shares import OutlinePieces, outline_pieces
 from surfkit.apps.maps.geotiff import GDAL_CACHE_MB, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.map_grid import MapGrid, Window
+from surfkit.apps.maps.map_settings import VOLUME_OPTION
 from surfkit.apps.maps.volume_base import BaseKind, base_of, outline_heights
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.optional import needed
+from surfkit.io.area import AREA_OPTION, Area
 from surfkit.io.polygon_file import AreaPolygon
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ BLOCK_ROWS, BLOCK_COLUMNS = 512, 2048
 """Cells that are in memory at once. They do not depend on --tile, so volumes do not either, to the last bit."""
 TOLD_MISSING = 0.01
 """Share of a polygon without surface from which on a message tells of it."""
+MAX_CUT_OFF_SHARE = 1e-6
+"""Share of a polygon outside the area of the map that is rounding."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,29 @@ class VolumeSettings:
 
     base: BaseKind | float
     least_difference: float = 0.0
+
+
+def tell_cut_off(polygons: Sequence[AreaPolygon], area: Area, unit: str) -> None:
+    """Refuse polygons of volumes that lie outside the area of the map, and say of which a part does.
+
+    Raises:
+        BadInput: One of them has no part within.
+    """
+    for each in polygons:
+        within, whole = each.shape.intersection(area.shape).area, each.shape.area
+        if not within > 0:
+            raise BadInput(
+                f"{VOLUME_OPTION}: polygon {each.name!r} lies outside the polygons of {AREA_OPTION}, where nothing is "
+                f"drawn; leave {AREA_OPTION} out, or draw its polygons around it"
+            )
+        if whole - within > MAX_CUT_OFF_SHARE * whole:
+            share = 100 * (whole - within) / whole
+            emit(
+                Warned(
+                    f"polygon {each.name!r}: {share:.1f}% of it, {whole - within:,.4g} {unit}², lies outside the "
+                    f"polygons of {AREA_OPTION} and is not measured, and its base has no heights there"
+                )
+            )
 
 
 def measure_volumes(

@@ -27,6 +27,8 @@ ARROW_SHARE = 0.08
 """Length of the longest arrow, as a share of the picture."""
 LISTED_MARKS = 5
 """Wrong marks that are named one by one."""
+FAR_TIMES, FAR_M = 10, 0.1
+"""A checkpoint is far off from so many times the residuals of control points on, and so many metres."""
 SYMBOLS = {"control": ("o", "tab:green"), "checkpoint": ("s", "tab:purple"), "left out": ("X", "red")}
 """Of points in the picture, by what they are."""
 
@@ -56,6 +58,13 @@ def warnings_of(where: ControlResiduals) -> Iterator[str]:
         yield (
             f"{len(said)} ground control points contradict the others and are left out: {few(said)}; the marks of each "
             "agree, so its surveyed place is wrong, or they are all on something else"
+        )
+    fit = math.hypot(*where.rms(where.control).values()) if where.control else 0.0
+    off = {name: math.hypot(*where.residuals[name]) for name in where.checkpoints if name in where.residuals}
+    if far := [f"{name} ({away:.2f} m)" for name, away in off.items() if away > max(FAR_TIMES * fit, FAR_M)]:
+        yield (
+            f"{len(far)} checkpoints are off by more than {FAR_TIMES} times what control points are ({fit:.2f} m RMS): "
+            f"{few(far)}; their surveyed places are wrong, or the model bends away from the control points"
         )
     if where.unseen:
         yield (

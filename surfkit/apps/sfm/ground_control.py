@@ -152,8 +152,8 @@ def place_by_points(
     across = given.scale * sizes[1] * chart.metres
     if rms / np.sqrt(3) > MAX_TURN_ERROR * across:
         return NoSimilarity(
-            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points that spread by "
-            f"{across / np.sqrt(len(residuals)):.1f} m"
+            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points; are the marks on these "
+            "points and in these photographs, and the coordinates in the system that the list names?"
         )
     return ControlResiduals(
         chart,

@@ -123,6 +123,18 @@ def test_bounds_and_area_hold_both(tmp_path):
     assert record["covered"] == pytest.approx(1, abs=0.01)
 
 
+def test_volumes_that_the_area_cuts_off_are_told_and_those_outside_refused(tmp_path, heard):
+    area = write_polygons(tmp_path / "site.gpkg", HOLED)
+    inside = write_polygons(tmp_path / "inside.gpkg", box(3, 3, 5, 5))
+    mapped(tmp_path / "maps", area, volume=inside)
+    assert "outside" not in " ".join(heard)
+    mapped(tmp_path / "maps", area, volume=write_polygons(tmp_path / "half.gpkg", box(4, 7, 8, 9)))
+    assert "50.0% of it, 4 m², lies outside the polygons of --area" in " ".join(heard)
+    with pytest.raises(BadInput, match="--volume: polygon 'a' lies outside the polygons of --area"):
+        mapped(tmp_path / "none", area, volume=write_polygons(tmp_path / "hole.gpkg", box(7, 7, 9, 9)))
+    assert not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize(
     "shape, said",
     [

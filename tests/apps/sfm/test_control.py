@@ -215,6 +215,16 @@ def test_positions_of_photographs_keep_their_common_error(flown, tmp_path):
     assert without.adjustment["positions"] == 0 and without.adjustment["no_positions"] == "--no-gps"
 
 
+def test_a_checkpoint_that_is_far_off_is_told(flown, tmp_path):
+    flight, model = flown
+    given = listed(flight)
+    _, where = done(flight, model, given, tmp_path)
+    assert not list(warnings_of(where))
+    away = {**where.residuals, "C2": (3.0, 0.0, 4.0)}
+    (line,) = warnings_of(replace(where, residuals=away))
+    assert "1 checkpoints are off by more than 10 times" in line and "C2 (5.00 m)" in line
+
+
 def test_tables_and_proposals(flown, tmp_path):
     flight, model = flown
     given = listed(flight)
