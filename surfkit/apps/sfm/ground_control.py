@@ -152,7 +152,7 @@ def place_by_points(
     across = given.scale * sizes[1] * chart.metres
     if rms / np.sqrt(3) > MAX_TURN_ERROR * across:
         return NoSimilarity(
-            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points; are the marks on these "
+            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points; are the marks on the "
             "points and in these photographs, and the coordinates in the system that the list names?"
         )
     return ControlResiduals(
