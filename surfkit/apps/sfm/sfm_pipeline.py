@@ -228,6 +228,8 @@ class SfmPreparation:
             if isinstance(where, ControlResiduals):
                 model.transform(_sim3d(where.similarity))
                 return self._adjusted_to_points(number, model, replace(where, wrong_marks=tuple(wrong)), site, photos)
+            if number == 0:  # smaller ones may show none of the points
+                raise BadInput(f"--gcp {self.settings.gcp}: {where.reason}; correct the list, or leave it out")
         elif isinstance(site, PositionHypothesis):
             held = {name for name, photo in photos.items() if photo.exif.is_focal_held}
             photos = {photo.name: photo for photo in site.photos}

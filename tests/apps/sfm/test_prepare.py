@@ -439,10 +439,10 @@ def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared,
     exchanged = [" ".join([f"{y + 5e5} {x + 5e5}", *rest]) for x, y, rest in rows]
     (tmp_path / "gcp_list.txt").write_text("\n".join([lines[0], *exchanged]))
     words = ["--gcp", str(tmp_path / "gcp_list.txt"), *QUICK]
-    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 0
-    said = capsys.readouterr().err
-    assert "upside down, 1" in said and "m below the ground" in said
-    assert read(Data(tmp_path / "s")).frame.crs is None
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "gcp_list.txt: " in said and "upside down, 1" in said and "m below the ground" in said
+    assert read(Data(tmp_path / "s")).frame.crs == "EPSG:32633", "what was there is kept"
 
 
 def test_geo_txt_places_it_instead_of_exif(folder, prepared, tmp_path, monkeypatch, capsys):

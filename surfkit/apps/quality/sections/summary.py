@@ -184,7 +184,10 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
     if left := texts(survey.ground_control, "left_out"):
         said.append(f"Control points contradict the others and were left out: {', '.join(left)}.")
     if left := list(mapping(survey.georeference, "left_out")):
-        said.append(f"{len(left)} positions of photographs contradict the others and were left out.")
+        what = "1 position of a photograph contradicts the others and was" if len(left) == 1 else (
+            f"{len(left)} positions of photographs contradict the others and were"
+        )  # fmt: skip
+        said.append(f"{what} left out.")
     said += focal_warnings(survey)
     if found.counts is not None:
         known = found.counts[np.isfinite(found.counts)]
@@ -201,13 +204,13 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
 def focal_warnings(survey: Survey) -> list[str]:
     """What is known of the focal length from one source only: heights depend on it."""
     weighed, said = mapping(survey.model_facts, "weighed"), []
+    remedy = "The residuals of check points tell." if survey.ground_control else "Check heights with control points."
     for lens in weighed.get("focal_lengths_px") or ():
         if isinstance(lens, dict) and lens.get("held") is True:
             exif, alone = number(lens, "exif") or 0.0, number(lens, "photographs_alone") or 0.0
             said.append(
                 "All photographs look the same way, so heights are as exact as the focal length in EXIF "
-                f"({exif:.0f} px), which the photographs alone contradict ({alone:.0f} px). Check heights with control "
-                "points."
+                f"({exif:.0f} px), which the photographs alone contradict ({alone:.0f} px). {remedy}"
             )
     ground, start = number(weighed, "cameras_above_ground_m"), number(weighed, "cameras_above_start_m")
     if ground and start and (said or abs(ground / start - 1) > MAX_START_RATIO):
