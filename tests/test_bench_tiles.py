@@ -45,7 +45,7 @@ def test_a_camera_on_earth_sees_a_point_of_a_tileset_where_it_sees_it_on_the_map
     assert np.abs(seen[:, :2] / seen[:, 2:] - wanted[:, :2] / wanted[:, 2:]).max() < 5e-4
 
 
-def test_the_oblique_camera_looks_at_the_same_place_from_the_same_distance(tiles):
+def test_a_camera_that_is_moved_looks_at_the_same_place_from_farther_away(tiles):
     class Scene:
         frame = Frame(np.zeros(3), 1.0)
 
@@ -55,11 +55,11 @@ def test_the_oblique_camera_looks_at_the_same_place_from_the_same_distance(tiles
             xyz = torch.tensor([[0.0, 0, -40], [3, 1, -40], [0, 2, -40]])
 
     shot = tiles.Shot("photograph", np.eye(4), 50.0, (60, 40), np.zeros((40, 60, 3)))
-    moved = tiles._moved(shot, Scene)
+    moved = tiles._moved("oblique", shot, Scene, np.radians(50), 2.0)
     target = np.array([0, 0, -40.0])
     to = target - moved.pose[:3, 3]
-    assert np.linalg.norm(to) == pytest.approx(40)
-    assert -moved.pose[:3, 2] == pytest.approx(to / 40)
+    assert np.linalg.norm(to) == pytest.approx(80)
+    assert -moved.pose[:3, 2] == pytest.approx(to / 80)
     assert moved.photo is None and moved.pose[1, 3] < -1  # from the lower side of the picture
 
 
@@ -68,7 +68,9 @@ def test_mirrored_holed_shifted_and_failing_pictures_are_wrong(tiles, tmp_path):
     small = rng.uniform(30, 220, (10, 15, 3))
     photo = np.kron(small, np.ones((4, 4, 1)))
     shot = tiles.Shot("photograph", np.eye(4), 50.0, (60, 40), photo)
-    target = tiles.Target("t", "cesium", Path("tileset.json"))
+    index = tmp_path / "tileset.json"
+    index.write_text('{"root": {"children": [{"content": {"uri": "tiles/0.glb"}}]}}')
+    target = tiles.Target("t", "cesium", index)
 
     def is_right(picture, said=(), **more):
         path = tmp_path / "x.png"

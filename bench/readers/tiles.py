@@ -4,8 +4,8 @@
     python bench/readers/tiles.py RUN --textures RUN/texture --out FOLDER     # what `surfkit texture` wrote
     python bench/readers/tiles.py RUN --splats scene.tiles --out FOLDER       # and `surfkit export RUN format:tiles3d`
 
-The cameras are those of a photograph in the middle of the survey: all of it, its inner quarter, and one that is moved
-in a circle about what it looks at. Where the data set has a coordinate reference system, pyproj takes them to the
+The cameras are those of a photograph in the middle of the survey: all of it, its inner quarter, and two farther away,
+one of them oblique, for which coarser tiles are enough. Where the data set has a coordinate reference system, pyproj takes them to the
 Earth, and not surfkit. So a tileset in another place shows nothing. A picture is right if it is like the photograph, or
 like textured.glb drawn by three.js from the same camera, and clearly less like it when mirrored; if it has no hole that
 the GLB file has not; and if no tile failed and the console shows no error. The figures go to
@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +28,7 @@ from PIL import Image
 from scipy.ndimage import maximum_filter
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-from check import Row, failed, table_of  # noqa: E402
+from check import Row, failed, leaves, table_of  # noqa: E402
 from machine import save  # noqa: E402
 from pictures import psnr_of, world_of  # noqa: E402
 from programs import HERE, Missing, find_chromium, find_node, node  # noqa: E402
@@ -42,8 +43,10 @@ WIDTH = 600
 """Pixels; software draws slowly."""
 ERROR_PX = 16
 """The geometric error at which both viewers load finer tiles by default."""
-INNER, TILT = 0.25, np.radians(50)
-"""Share of the photograph that the second camera shows; angle by which the third one is moved."""
+INNER = 0.25
+"""Share of the photograph that the second camera shows."""
+AWAY = {"oblique": (50, 2), "far": (0, 4)}
+"""Degrees by which other cameras move about what they look at, and how many times as far away they are."""
 LIKE_GLB_DB, MIRRORED_DB, HOLES = 24.0, 2.0, 1e-3
 """Least PSNR to the GLB file: coarser tiles have texels of up to a pixel. What a picture is better by than a mirrored
 one. Largest share of pixels that are background in a tileset only."""
@@ -73,7 +76,8 @@ def cameras_of(scene: Scene) -> list[Shot]:
     """The cameras to draw from: of the photograph that is nearest to the middle of all."""
     view = min(scene.train, key=lambda view: float(view.camera.centre.norm()))
     whole = _crop("photograph", scene, view, 1.0)
-    return [whole, _crop("inner", scene, view, INNER), _moved(whole, scene)]
+    moved = [_moved(name, whole, scene, np.radians(tilt), times) for name, (tilt, times) in AWAY.items()]
+    return [whole, _crop("inner", scene, view, INNER), *moved]
 
 
 def _crop(name: str, scene: Scene, view: View, share: float) -> Shot:
@@ -91,14 +95,14 @@ def _crop(name: str, scene: Scene, view: View, share: float) -> Shot:
     return Shot(name, pose, float(np.degrees(2 * np.arctan(half[1] / camera.fy))), size, photo)
 
 
-def _moved(shot: Shot, scene: Scene) -> Shot:
-    """The camera moved in a circle about what is in the middle of its picture, by the median distance of points."""
+def _moved(name: str, shot: Shot, scene: Scene, tilt: float, times: float) -> Shot:
+    """The camera moved about the middle of its picture, at the median depth of points, and then back."""
     seen = (scene.frame.to_input(scene.cloud.xyz.double().numpy()) - shot.pose[:3, 3]) @ shot.pose[:3, :3]
-    distance = float(np.median(-seen[:, 2]))
-    turn, back = np.eye(4), np.eye(4)
-    turn[1:3, 1:3] = [[np.cos(TILT), -np.sin(TILT)], [np.sin(TILT), np.cos(TILT)]]
-    back[2, 3] = distance
-    return replace(shot, name="oblique", pose=shot.pose @ np.linalg.inv(back) @ turn @ back, photo=None)
+    depth = float(np.median(-seen[:, 2]))
+    turn, to, back = np.eye(4), np.eye(4), np.eye(4)
+    turn[1:3, 1:3] = [[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]
+    to[2, 3], back[2, 3] = -depth, times * depth
+    return replace(shot, name=name, pose=shot.pose @ to @ turn @ back, photo=None)
 
 
 def on_earth(pose: np.ndarray, crs: str) -> np.ndarray:
@@ -136,12 +140,14 @@ class Target:
         viewer: The page.
         path: tileset.json, or the GLB file that tilesets are compared with.
         is_mesh: Whether it has triangles, or splats.
+        is_for_it: Whether the viewer is known to draw such files. What it makes of others is told, and not judged.
     """
 
     name: str
     viewer: str
     path: Path
     is_mesh: bool = True
+    is_for_it: bool = True
 
     def entry(self, shot: Shot, frame: Frame, out: Path) -> dict[str, Any]:
         """A picture of it as view.mjs takes it."""
@@ -157,8 +163,24 @@ def targets_of(textures: list[Path], splats: list[Path]) -> list[Target]:
     glb = next((path for folder in textures if (path := folder / "textured.glb").is_file()), None)
     tilesets = [(path.name, path / "tiles3d/tileset.json", True) for path in textures]
     tilesets += [(path.name, path / "tileset.json", False) for path in splats]
-    found = [Target(name, viewer, path, is_mesh) for name, path, is_mesh in tilesets for viewer in VIEWERS]
+    found = [
+        Target(name, viewer, path, is_mesh, is_mesh or (viewer == "cesium" and is_packed(path)))
+        for name, path, is_mesh in tilesets
+        for viewer in VIEWERS
+    ]
     return ([Target("glb", "tiles-renderer", glb)] if glb else []) + found
+
+
+def depths_of(tile: dict[str, Any], depth: int = 0) -> dict[str, int]:
+    """How deep below the root the content of a tile, and of each one below it, lies."""
+    own = {tile["content"]["uri"]: depth} if "content" in tile else {}
+    return own | {uri: at for child in tile.get("children", []) for uri, at in depths_of(child, depth + 1).items()}
+
+
+def is_packed(path: Path) -> bool:
+    """Whether the splats of a tileset are compressed as SPZ."""
+    tile = leaves(json.loads(path.read_text())["root"])[0]
+    return any("spz" in name for name in read_glb(path.parent / tile["content"]["uri"]).root["extensionsUsed"])
 
 
 def draw(pictures: list[tuple[Target, Shot]], frame: Frame, out: Path) -> list[dict[str, Any]]:
@@ -191,16 +213,18 @@ def like(picture: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
 
 
 def judged(target: Target, shot: Shot, answer: dict[str, Any], glb: np.ndarray | None) -> Row:
-    """The row of a picture. What a viewer that draws no splats makes of them is told, and not judged."""
+    """The row of a picture; with the (H, W, 3) picture of the GLB file, if there is one."""
     name = f"{target.name}, {shot.name}"
     errors = [said for said in answer["said"] if said.startswith("error")]
     faults = [*answer.get("faults", []), *errors, *([answer["error"]] if "error" in answer else [])]
-    is_for_it = target.is_mesh or target.viewer == "cesium"
-    if "drawn" not in answer or (faults and is_for_it):
+    if "drawn" not in answer or faults:
         row = failed(Path(name), target.viewer, ValueError("; ".join(faults)))
-        return row if is_for_it else replace(row, is_right=None)
+        return row if target.is_for_it else replace(row, is_right=None)
     kinds = "".join(f", {kind}" for kind in answer.get("kinds", []))
-    told, is_right = [f"{len(answer['drawn'])} tiles{kinds}"], bool(answer["drawn"])
+    depths = depths_of(json.loads(target.path.read_text())["root"])
+    counts = Counter(depths[uri] for uri in answer["drawn"])
+    told = [", ".join(f"{count} tiles of depth {depth}" for depth, count in sorted(counts.items())) + kinds]
+    is_right = bool(answer["drawn"])
     picture = pixels_of(Path(answer["out"]))
     if glb is not None and target.is_mesh:
         same, turned = like(picture, glb)
@@ -211,7 +235,7 @@ def judged(target: Target, shot: Shot, answer: dict[str, Any], glb: np.ndarray |
         same, turned = like(picture, shot.photo)
         told.append(f"{same:.1f} dB to the photograph, mirrored {turned:.1f}")
         is_right &= same > turned + MIRRORED_DB
-    return Row(name, target.viewer, bool(is_right) if is_for_it else None, None, "; ".join(told + faults)[:300])
+    return Row(name, target.viewer, bool(is_right) if target.is_for_it else None, None, "; ".join(told))
 
 
 def main() -> None:

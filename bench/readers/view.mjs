@@ -39,9 +39,9 @@ for (const shot of shots) {
     const limit = new Promise((_, fail) => setTimeout(() => fail(new Error("no picture within 120 s")), 120000));
     const answer = await Promise.race([job, limit]);
     await page.screenshot({ path: shot.out });
-    answers.push({ ...answer, said });
+    answers.push({ ...answer, said: [...new Set(said)] });
   } catch (error) {
-    answers.push({ error: String(error.message ?? error), said });
+    answers.push({ error: String(error.message ?? error), said: [...new Set(said)] });
   }
   await page.close();
 }
