@@ -5,10 +5,10 @@
     python bench/readers/tiles.py RUN --splats scene.tiles --out FOLDER       # and `surfkit export RUN format:tiles3d`
 
 The cameras are those of a photograph in the middle of the survey: all of it, its inner quarter, and two farther away,
-one of them oblique, for which coarser tiles are enough. Where the data set has a coordinate reference system, pyproj takes them to the
-Earth, and not surfkit. So a tileset in another place shows nothing. A picture is right if it is like the photograph, or
-like textured.glb drawn by three.js from the same camera, and clearly less like it when mirrored; if it has no hole that
-the GLB file has not; and if no tile failed and the console shows no error. The figures go to
+one of them oblique, for which coarser tiles are enough. Where the data set has a coordinate reference system, pyproj
+takes them to the Earth, and not surfkit. So a tileset in another place shows nothing. A picture is right if it is like
+the photograph, or like textured.glb drawn by three.js from the same camera, and clearly less like it when mirrored; if
+it has no hole that the GLB file has not; and if no tile failed and the console shows no error. The figures go to
 bench/results/tiles_viewers.json, the pictures and what the pages said to FOLDER. Exit status 1 if anything is wrong.
 """
 
@@ -218,7 +218,7 @@ def judged(target: Target, shot: Shot, answer: dict[str, Any], glb: np.ndarray |
     errors = [said for said in answer["said"] if said.startswith("error")]
     faults = [*answer.get("faults", []), *errors, *([answer["error"]] if "error" in answer else [])]
     if "drawn" not in answer or faults:
-        row = failed(Path(name), target.viewer, ValueError("; ".join(faults)))
+        row = failed(Path(name), target.viewer, ValueError(" ".join("; ".join(faults).split())))
         return row if target.is_for_it else replace(row, is_right=None)
     kinds = "".join(f", {kind}" for kind in answer.get("kinds", []))
     depths = depths_of(json.loads(target.path.read_text())["root"])
