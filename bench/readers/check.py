@@ -43,7 +43,7 @@ class Row:
     """One program and one file.
 
     Attributes:
-        is_right: None if the program is not installed.
+        is_right: None if the program is not installed, or draws no such files.
         worst: The largest error as a share of what is allowed, or None where positions or messages were looked at.
     """
 
@@ -308,7 +308,7 @@ def table_of(rows: list[Row]) -> str:
     lines = [f"{'file':24}{'program':22}{'':7}{'share':>8}  note"]
     for row in rows:
         share = "" if row.worst is None else f"{row.worst:8.3f}"
-        state = {True: "ok", False: "FAULT", None: "absent"}[row.is_right]
+        state = {True: "ok", False: "FAULT", None: "n/a"}[row.is_right]
         lines.append(f"{row.file:24}{row.program:22}{state:7}{share:>8}  {row.note}")
     return "\n".join(lines)
 

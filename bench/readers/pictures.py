@@ -45,6 +45,9 @@ def world_of(path: Path) -> np.ndarray:
     """(4, 4) from the coordinates of the PLY file to those in which a viewer sees a file."""
     if path.suffix == ".glb":
         return np.array(three(path)[1]["matrix"]).reshape(4, 4).T
+    if path.is_dir() and (path / "tileset.json").is_file():
+        root = json.loads((path / "tileset.json").read_text())["root"]
+        return np.array(root.get("transform", np.eye(4).ravel())).reshape(4, 4).T
     return HALF_TURN if path.suffix == ".spz" and not is_as_in_ply(path) else np.eye(4)
 
 
@@ -94,11 +97,11 @@ def _judged(shot: dict, answer: dict, wanted: np.ndarray, folder: Path) -> Row:
         return failed(Path(name), shot["viewer"], ValueError(answer.get("error") or "; ".join(answer["faults"])))
     picture = Image.open(shot["out"]).convert("RGB")
     small = np.asarray(picture.resize(wanted.shape[1::-1], Image.BOX), np.float64)
-    ours = _psnr(small, wanted)
-    turned = max(_psnr(small[:, ::-1], wanted), _psnr(small[::-1], wanted), _psnr(small[::-1, ::-1], wanted))
+    ours = psnr_of(small, wanted)
+    turned = max(psnr_of(small[:, ::-1], wanted), psnr_of(small[::-1], wanted), psnr_of(small[::-1, ::-1], wanted))
     first = folder / f"{shot['viewer']}.model.ply.png"
     alike = (
-        _psnr(np.asarray(picture, np.float64), np.asarray(Image.open(first).convert("RGB"), np.float64))
+        psnr_of(np.asarray(picture, np.float64), np.asarray(Image.open(first).convert("RGB"), np.float64))
         if first.exists()
         else None
     )
@@ -111,6 +114,6 @@ def _judged(shot: dict, answer: dict, wanted: np.ndarray, folder: Path) -> Row:
     return Row(name, shot["viewer"], is_right, None, note)
 
 
-def _psnr(a: np.ndarray, b: np.ndarray) -> float:
+def psnr_of(a: np.ndarray, b: np.ndarray) -> float:
     """Of colours from 0 to 255."""
     return psnr(torch.tensor(a / 255), torch.tensor(b / 255))

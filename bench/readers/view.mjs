@@ -15,6 +15,7 @@ const TYPES = { ".html": "text/html", ".js": "text/javascript", ".mjs": "text/ja
 
 const server = http.createServer((request, response) => {
   const [, root, ...rest] = decodeURIComponent(new URL(request.url, "http://x").pathname).split("/");
+  if (root === "favicon.ico") { response.writeHead(204).end(); return; }
   const base = ROOTS[root], file = base && path.join(base, ...rest);
   if (!file || !file.startsWith(base) || !fs.existsSync(file) || fs.statSync(file).isDirectory()) { response.writeHead(404).end(); return; }
   response.writeHead(200, { "content-type": TYPES[path.extname(file)] ?? "application/octet-stream", "content-length": fs.statSync(file).size });
@@ -28,8 +29,8 @@ const browser = await puppeteer.launch({ executablePath: chromium, headless: tru
 const answers = [];
 for (const shot of shots) {
   const page = await browser.newPage(), said = [];
-  page.on("console", (m) => { if (["error", "warn"].includes(m.type())) said.push(m.text()); });
-  page.on("pageerror", (e) => said.push(String(e.message ?? e)));
+  page.on("console", (m) => { if (["error", "warn"].includes(m.type())) said.push(`${m.type()}: ${m.text()}`); });
+  page.on("pageerror", (e) => said.push(`error: ${e.message ?? e}`));
   try {
     await page.setViewport({ width: shot.width, height: shot.height, deviceScaleFactor: 1 });
     await page.goto(`${site}/pages/${shot.viewer}.html`, { waitUntil: "load" });
@@ -38,9 +39,9 @@ for (const shot of shots) {
     const limit = new Promise((_, fail) => setTimeout(() => fail(new Error("no picture within 120 s")), 120000));
     const answer = await Promise.race([job, limit]);
     await page.screenshot({ path: shot.out });
-    answers.push({ ...answer, said });
+    answers.push({ ...answer, said: [...new Set(said)] });
   } catch (error) {
-    answers.push({ error: String(error.message ?? error), said });
+    answers.push({ error: String(error.message ?? error), said: [...new Set(said)] });
   }
   await page.close();
 }

@@ -145,7 +145,8 @@ class ExportCommand:
         """The levels of detail of a run; all splats in one tile if it has none."""
         if run.lod_record.exists():
             return load_levels(run, model).tiles(frame)
-        emit(Warned(f"{self.source} has no levels of detail, so all is one tile; `{run.to_paste('lod')}` makes them"))
+        remedy = f"`{run.to_paste('lod')}` makes them"
+        emit(Warned(f"{self.source} has no levels of detail, so viewers load all splats at once; {remedy}"))
         return one_tile(table)
 
 
