@@ -11,6 +11,7 @@ import numpy as np
 
 from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.fill import PaintInput, Pictures, encoded, paint
+from surfkit.apps.texture.level_error import level_error
 from surfkit.apps.texture.obj_glb import SUFFIX, AtlasPageMesh, material_lines, part_of, write_obj, write_textured_glb
 from surfkit.apps.texture.regions import Region
 from surfkit.apps.texture.textured_tileset import TilesetWriter
@@ -105,7 +106,8 @@ def deliver(fine: TexturedMesh, coarser: Iterable[TexturedMesh], how: TextureExp
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
         for number, made in enumerate(coarser, 1):
             drawn = painted(made.paint, how.pictures, how.work / f"level-{number}")
-            tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, made.texel)
+            error = max(made.texel, level_error(what.mesh, made.paint.mesh) / frame.scale)
+            tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, error)
         tiles.finish(fine.region)
         files.append(f"{TILES_FOLDER}/tileset.json")
     return files

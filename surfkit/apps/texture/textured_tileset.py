@@ -20,7 +20,8 @@ from surfkit.io.splats.tileset import INDEX, box_json, ground_of, tileset
 from surfkit.scene.scene import Frame
 
 REFINE_ERROR_PX = 16.0
-"""Geometric errors of as many pixels or more make viewers refine, by default: where a texel takes a pixel."""
+"""Geometric errors of as many pixels or more make viewers refine, by default: where a texel takes a pixel, or the
+surface is off by one."""
 
 
 class TilesetWriter:
@@ -40,7 +41,7 @@ class TilesetWriter:
         self.folder, self.frame, self.pictures = folder, frame, pictures
         self.ground = ground_of(Path(folder.name), frame, up, geoid=geoid)  # not the name that it has until it is whole
         self.written: dict[int, tuple[dict[str, Any], np.ndarray]] = {}  # by identity of the region
-        self.count = 0
+        self.count, self.error = 0, 0.0  # of a level above is no less than that of one below
 
     def write(
         self,
@@ -48,7 +49,7 @@ class TilesetWriter:
         paint: PaintInput,
         parts: Sequence[AtlasPageMesh],
         pages: Sequence[Path],
-        texel: float,
+        error: float,
     ) -> None:
         """Write the tiles of a level, the finest first; regions that have a tile already keep it.
 
@@ -57,8 +58,11 @@ class TilesetWriter:
             paint: The textured mesh of the level.
             parts: The triangles of each page.
             pages: The file of each page.
-            texel: Side of a texel, units of the input; 0 for the finest level.
+            error: Side of a texel, or how far the surface lies from that of the finest level if that is more, units of
+                the input; 0 for the finest level.
         """
+
+        self.error = max(self.error, error)
 
         def place(local: np.ndarray) -> np.ndarray:
             return self.ground.metres(self.frame.to_input(local))
@@ -71,7 +75,7 @@ class TilesetWriter:
             self.count += 1
             files = [parts[at] for at in mine], [pages[at] for at in mine]
             corners = write_textured_glb(self.folder / name, paint.mesh, *files, self.pictures, place, UPS["z"])
-            found = {"geometricError": REFINE_ERROR_PX * texel * self.ground.unit, "content": {"uri": name}}
+            found = {"geometricError": REFINE_ERROR_PX * self.error * self.ground.unit, "content": {"uri": name}}
             self.written[id(region)] = found, corners
 
     def finish(self, region: Region) -> None:

@@ -11,7 +11,7 @@ from needs import needs, needs_native
 from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
-from surfkit.apps.texture import candidates, pieces
+from surfkit.apps.texture import candidates, find_candidates, pieces
 from surfkit.apps.texture import seam_levelling as leveling
 from surfkit.apps.texture import texture_mesh as make
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
@@ -597,7 +597,8 @@ def test_photographs_that_are_all_damaged_make_a_note(tmp_path, monkeypatch):
     scene, told = town(tmp_path), []
     for view in scene.views:
         view.path.write_bytes(b"damaged")
-    monkeypatch.setattr(make, "emit", told.append)
+    for module in (make, find_candidates):
+        monkeypatch.setattr(module, "emit", told.append)
     record = made(scene, tmp_path / "out", replace(PNG, formats=("obj",)))
     assert record["seen"] == 0 and sum(isinstance(event, PhotoSkipped) for event in told) == 12
     (warned,) = [event.text for event in told if isinstance(event, Warned)]
