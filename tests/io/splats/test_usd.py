@@ -17,8 +17,9 @@ from surfkit.io.usdz import write_usdz
 from surfkit.scene.scene import Frame
 from surfkit.testing.format_checks import check_format, splat_table
 
-pxr = needs("pxr")
-from pxr import Gf, Usd, UsdGeom, UsdValidation, UsdVol, Vt  # noqa: E402
+Gf, Usd, UsdGeom, UsdValidation, UsdVol, Vt = (
+    needs(f"pxr.{part}") for part in ("Gf", "Usd", "UsdGeom", "UsdValidation", "UsdVol", "Vt")
+)
 
 SHIFT = (500_000.0, 5_600_000.0, 0.0)
 SURVEY = Frame(np.array(SHIFT), 1.0, 2.0, "EPSG:32633", shift=SHIFT)
