@@ -106,8 +106,8 @@ def deliver(fine: TexturedMesh, coarser: Iterable[TexturedMesh], how: TextureExp
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
         for number, made in enumerate(coarser, 1):
             drawn = painted(made.paint, how.pictures, how.work / f"level-{number}")
-            error = max(made.texel, level_error(what.mesh, made.paint.mesh) / frame.scale)
-            tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, error)
+            off = max(made.texel, level_error(what.mesh, made.paint.mesh) / frame.scale)
+            tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, off)
         tiles.finish(fine.region)
         files.append(f"{TILES_FOLDER}/tileset.json")
     return files
