@@ -83,17 +83,25 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
     Raises:
         BadInput: They may not be made, or cannot.
     """
-    before, own = run.data.priors, replace(run, data=replace(run.data, priors=None))
     if not mesher.needs_prior_of(scene.train, scene.frame):
         yield run
-    elif before is not None and is_there(before):
+    else:
+        with with_maps_of(run, scene, caches, device, "the mesh") as found:
+            yield found
+
+
+@contextmanager
+def with_maps_of(run: Run, scene: Scene, caches: CacheSettings, device: Device, what: str) -> Iterator[Run]:
+    """Within, a trained run has depth maps, as far as they can be had; `what` needs them. See `with_maps_to_mesh`."""
+    before, own = run.data.priors, replace(run, data=replace(run.data, priors=None))
+    if before is not None and is_there(before):
         with mark_used(located(before)):
             yield run
     elif prior_files(own.data, scene) or run.recipe.depth is None:
         yield own
     elif caches.maps is None:
         raise BadInput(
-            f"{run.out}: the mesh needs depth maps, and there are none; leave out --no-prepare to make them, or give "
+            f"{run.out}: {what} needs depth maps, and there are none; leave out --no-prepare to make them, or give "
             f"`surfkit prepare depth {shlex.quote(str(run.data.path))}` first"
         )
     else:

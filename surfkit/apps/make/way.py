@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from surfkit.apps.make.plan import decide, recipe_of, rows
 from surfkit.apps.make.quality import QualityName
 from surfkit.apps.make.record import MAKE_RECORD, Delivery
 from surfkit.apps.maps.command import MapsCommand
+from surfkit.apps.maps.map_settings import MapSettings
 from surfkit.apps.maps.owned_files import MAPS_RECORD
 from surfkit.apps.prepare_photos import PreparePhotosCommand
 from surfkit.apps.quality.report import DEFAULT_HTML, DEFAULT_PDF, write_quality
@@ -26,6 +27,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import say
 from surfkit.core.stages import key_of
 from surfkit.io.datasets.data import Data, ReadSettings
+from surfkit.io.datasets.depth_prior import prior_files
 from surfkit.io.datasets.read import read
 from surfkit.raster.select import Device
 from surfkit.runs.blocks.train_blocks import Compute
@@ -105,13 +107,26 @@ class Way:
             work = self._files_of(texture.run, self.out / TEXTURE, TEXTURE_RECORD)
             self._once("texture", self.out / TEXTURE, key_of(mesh, wanted.texture), work)
         if wanted.maps is not None:
-            maps = MapsCommand(self.out / RUN, self.out / MAPS, wanted.maps)
+            drawn = self._without_unknown_precision(wanted.maps, data)
+            maps = MapsCommand(self.out / RUN, self.out / MAPS, drawn)
             work = self._files_of(maps.run, self.out / MAPS, MAPS_RECORD)
-            self._once("maps", self.out / MAPS, key_of(mesh, wanted.maps), work)
+            self._once("maps", self.out / MAPS, key_of(mesh, drawn), work)
         self._once("report", self.out, key_of(mesh, self._text("metrics.json")), self._report)
         key = key_of(mesh, self._text("metrics.json"), self._maps_text(), wanted.pdf)
         self._once("quality", self.out, key, lambda: write_quality(self.out, self.out / DEFAULT_HTML, wanted.pdf))
         self._finish()
+
+    def _without_unknown_precision(self, maps: MapSettings, data: Data) -> MapSettings:
+        """The maps that can be drawn of the run: without depth maps no errors are known, and a line says so."""
+        if "precision" not in maps.products or opened(self.out / RUN).data.priors is not None:
+            return maps
+        with bars():
+            if prior_files(data, read(data)):
+                return maps
+        told = dict(self.delivery.record.left_out)
+        self.delivery.record.left_out["precision"] = "no depth maps could be made of the photographs"
+        self._tell_left_out(told)
+        return replace(maps, products=tuple(name for name in maps.products if name != "precision"))
 
     @property
     def _decisions(self) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +25,7 @@ from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_mesh, read_
 from surfkit.evaluate.geometry.top_surface import highest
 from surfkit.io.datasets.depth_prior import prior_files, read_priors
 from surfkit.runs.command import refuse_no_mesh
+from surfkit.runs.ensure_depth_maps import with_maps_of
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import opened
 from surfkit.runs.resume import read_unchanged
@@ -31,6 +33,7 @@ from surfkit.runs.run_notes import collect_notes
 from surfkit.runs.warn import note_held_out
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.scene import Frame, Scene
+from surfkit.train.data_cache import CacheSettings
 from surfkit.train.progress_bars import bars
 
 
@@ -75,13 +78,16 @@ class MapsCommand:
         run = opened(self.run_folder)
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
-        with collect_notes(), bars():
+        with collect_notes(), bars(), ExitStack() as use:
             scene, surface = read_unchanged(run), read_mesh(run.mesh)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(self.against, frame)
-            depths = stereo_depths(run, scene, self.settings) if "precision" in self.settings.products else None
+            depths = None
+            if "precision" in self.settings.products:
+                own = use.enter_context(with_maps_of(run, scene, CacheSettings(), "auto", "--products precision"))
+                depths = stereo_depths(own, scene, self.settings)
             record = make_maps(MeshWithPhotos(surface, frame, scene.train), self.settings, out, other, depths)
             note_held_out(run, scene)
         show(out, record)

@@ -21,6 +21,7 @@ from surfkit.apps.maps.geotiff import GeoTiffSettings
 from surfkit.apps.maps.hillshade import with_margin
 from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.rasters import NODATA
+from surfkit.apps.texture.pieces import box_corners, may_show
 from surfkit.core.events import Progress, emit
 from surfkit.io.datasets.depth_prior import DepthPrior, Priors
 from surfkit.scene.camera import Camera
@@ -109,9 +110,9 @@ class Rays:
         local = self.frame.to_local(places)
         met = Meetings(local, normals[row, column] @ self.grid.turn, self.frame.scale)
         if len(local):
-            corners = _corners(local)
+            box = box_corners(local.min(0)[None], local.max(0)[None])
             for at, view in enumerate(self.views):
-                if _may_see(view.camera, corners) and (prior := self.priors[at]) is not None:
+                if may_show(box, view.camera)[0] and (prior := self.priors[at]) is not None:
                     met.add(view.camera, prior)
         sigma, count = np.full((window.height, window.width), np.nan), np.zeros((window.height, window.width))
         sigma[row, column] = np.hypot(met.sigma(), STEP_SHARE * steps[row, column])
@@ -218,27 +219,6 @@ def _range(heights: np.ndarray, reach: int) -> np.ndarray:
         return ndimage.maximum_filter(np.where(known, heights, -np.inf), side) - ndimage.minimum_filter(
             np.where(known, heights, np.inf), side
         )
-
-
-def _corners(places: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of the box around (n, 3) places."""
-    ends = np.stack([places.min(0), places.max(0)])
-    return np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(8, 3)
-
-
-def _may_see(camera: Camera, corners: np.ndarray) -> bool:
-    """Whether no side of the pyramid that a camera sees has all of (8, 3) corners of a box behind it."""
-    pose = camera.world_to_camera.numpy()
-    x, y, z = pose[:3, :3] @ corners.T + pose[:3, 3:]
-    right, low = camera.width - camera.cx, camera.height - camera.cy
-    beyond = (
-        z <= 0,
-        camera.fx * x + camera.cx * z < 0,
-        camera.fx * x - right * z > 0,
-        camera.fy * y + camera.cy * z < 0,
-        camera.fy * y - low * z > 0,
-    )
-    return not any(bool(side.all()) for side in beyond)
 
 
 def write_precision(sheet: GeoTiffSettings, rays: Rays, model: str, names: Sequence[str], side: int) -> dict[str, Any]:
