@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from dataclasses import replace
 
 import pytest
 from needs import needs, needs_native
@@ -129,13 +130,24 @@ def test_what_is_not_installed_is_told_first_and_added_later(farm, monkeypatch, 
     assert "points: " in told[1] and "'surfkit[maps]'" in told[1]
     assert "for the steps of optimisation" in said.out and said.out.count("left out: ") == 2
     assert set(record(farm)["left_out"]) == {"texture", "points"}
-    assert record(farm)["decisions"]["forecast"]["seconds"] >= 0, (
-        "0 where other work makes more noise than the steps take"
-    )
+    assert record(farm)["decisions"]["forecast"]["memory_bytes"] > 1e6, "steps were measured"
     out = farm.parent / "delivery"
     assert (out / "maps/dsm.tif").exists() and not (out / "maps/points.copc.laz").exists()
     seen = calls(monkeypatch)
     assert make(farm) == 0 and seen == ["texture", "maps", "quality"] and record(farm)["left_out"] == {}
+
+
+@needs_native
+def test_without_depth_maps_the_precision_is_left_out(farm, unmeasured, monkeypatch, capsys):
+    needs("fast_simplification"), needs("rasterio"), needs("cv2")
+    plain = way.opened
+    monkeypatch.setattr(way, "opened", lambda out: replace(plain(out), data=replace(plain(out).data, priors=None)))
+    monkeypatch.setattr(way, "prior_files", lambda data, scene: {})
+    assert make(farm) == 0
+    assert "left out: precision: no depth maps" in capsys.readouterr().err
+    assert set(record(farm)["left_out"]) == {"precision"}
+    drawn = farm.parent / "delivery/maps"
+    assert (drawn / "dsm.tif").exists() and not (drawn / "precision.tif").exists()
 
 
 @needs_native
