@@ -14,10 +14,11 @@ from surfkit.densify import ADC, PruneByImportance, Trim
 from surfkit.densify.base import Prune, Signal
 from surfkit.densify.signal import LossGradient
 from surfkit.io.datasets.data import Data
-from surfkit.losses import L1, SSIM, DepthRegression, Distortion, NormalConsistency
+from surfkit.losses import L1, SSIM, Consensus, DepthRegression, Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import ContractedGrid, QuantileGrid
 from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.primitives.columns import RATES
 from surfkit.runs.pipeline import run
 from surfkit.runs.recipe import with_steps
 from surfkit.train.stage import rates_of
@@ -112,6 +113,19 @@ def test_citygs2_short_goes_on_at_the_pace_of_pretraining():
     whole, short = recipes()["citygs2"], recipes()["citygs2-short"]
     assert short.pretrain == whole.pretrain and short.tune.rates == short.pretrain.rates != whole.tune.rates
     assert replace(short.tune, rates=whole.tune.rates, prune=whole.tune.prune) == whole.tune and not short.tune.prune
+
+
+def test_dogs_grows_for_30000_of_80000_steps_and_then_agrees():
+    recipe = recipes()["dogs"]
+    grown, agreed = recipe.pretrain, recipe.tune
+    assert (grown.steps, agreed.steps) == (30_000, 50_000)
+    assert grown.densify.until == 30_000 and agreed.densify is None and not agreed.prune
+    assert [(prune.at, prune.ratio) for prune in grown.prune] == [((29_800,), 0.25)]
+    assert isinstance(agreed.regularizers["consensus"], Consensus) and recipe.context == "tuned"
+    whole = RATES["means"]  # one schedule of 80,000 steps, cut in two
+    for at in (0, 10_000, 30_000):
+        assert grown.rates["means"].at(at, 30_000) == pytest.approx(whole.at(at, 80_000))
+        assert agreed.rates["means"].at(at, 50_000) == pytest.approx(whole.at(30_000 + at, 80_000))
 
 
 def test_citygs2_on_the_scenes_of_its_paper():

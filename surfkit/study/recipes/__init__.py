@@ -11,9 +11,11 @@ from surfkit.densify.adc import ADC
 from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import AbsGradient
 from surfkit.densify.trim import Trim
+from surfkit.losses.consensus import Consensus
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
+from surfkit.partition.balanced import Balanced
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
@@ -107,6 +109,35 @@ LIGHT_GAUSSIANS = Recipe(
     compress=Vectree(ratio=0.6),
 )
 
+# 80,000 steps; points are added and dropped up to 30,000, and from then on the blocks agree. In print the first part is
+# in blocks too, each from its sparse points; the mean of copies is weighted by visibility; and a term of the product of
+# scales counts, which is nothing where a scene has a size of 1.
+CONSENSUS_STEPS, GROWING_STEPS = 80_000, 30_000
+BLOCKS_AGREE = Recipe(
+    about="3DGS, then blocks of equal work that agree on the points they have in common (DOGS, Chen and Lee 2024)",
+    primitive=Gaussian3D(),
+    pretrain=city.cut_short(
+        Stage(
+            CONSENSUS_STEPS,
+            densify=ADC(until=GROWING_STEPS),
+            prune=(PruneByImportance(at=(29_800,), ratio=0.25),),
+        ),
+        GROWING_STEPS,
+    ),
+    partition=Balanced(),
+    tune=Stage(
+        CONSENSUS_STEPS - GROWING_STEPS,
+        densify=None,
+        regularizers={"consensus": Consensus()},
+        rates={
+            name: replace(rate, start=rate.at(GROWING_STEPS, CONSENSUS_STEPS))
+            for name, rate in RATES.items()
+            if rate.end is not None
+        },
+    ),
+    context="tuned",
+)
+
 IMPORTED = Recipe(
     about="The splats of a file as they are (--method.file, or `surfkit import FILE`), measured and meshed",
     method=SplatImport(),
@@ -123,6 +154,7 @@ RECIPES = {
     "absgs": ABSOLUTE_GAUSSIANS,
     "trim2dgs": TRIMMED,
     "lightgaussian": LIGHT_GAUSSIANS,
+    "dogs": BLOCKS_AGREE,
     "surface": SURFACE,
     "surface-blocks": SURFACE_BLOCKS,
     "surface-short": SURFACE_SHORT,

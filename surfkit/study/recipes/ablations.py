@@ -289,6 +289,7 @@ METHODS_TABLE = Table(
             kept=False,
             paper=compared(0.765, 24.51, 0.215, 0.576, 0.450, 0.501),
         ),
+        Row("DOGS", recipe=RECIPES["dogs"], kept=False),
         Row("surface (ours)", recipe=RECIPES["surface"], kept=False),
         Row("stereo alone", recipe=RECIPES["stereo"], kept=False),
         Row("Mip-Splatting", recipe=RECIPES["mip-splatting"], kept=False),
