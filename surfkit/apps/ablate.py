@@ -27,6 +27,7 @@ from surfkit.study.foreign_meshes import OtherMesh
 from surfkit.study.rows import Trial
 from surfkit.study.shared_stages import sharing_lines
 from surfkit.study.study import TABLE_WRITERS, AblationPlan, ablate, mesh_alone, report_so_far, trials
+from surfkit.study.table_picture import write_picture
 from surfkit.study.table_text import LEGEND, STACKED, drawing, failures, lines
 from surfkit.study.truth import Truth
 
@@ -141,11 +142,13 @@ class AblateCommand:
             raise
         show(report)
         print()
+        picture = out / "ablation.png"
         written = [
             ("results", out / "ablation.json"),
             *(("table", out / f"ablation.{ending}") for ending in TABLE_WRITERS),
+            *([("picture", picture)] if write_picture(picture, report) else []),
+            ("runs", out / "runs"),
         ]
-        written.append(("runs", out / "runs"))
         print_table(("written", "path"), [(what, str(path)) for what, path in written])
         broken = failures(report)
         for line in broken:
