@@ -125,7 +125,9 @@ class AblationPlan:
         if outcome.figures is None:
             return False
         draws = "psnr" in outcome.figures  # a mesher alone draws no pictures that LPIPS could be measured on
-        wanted = ({"f1"} if trial.truth is not None else set()) | ({"lpips"} if self.lpips and draws else set())
+        wanted = ({trial.truth.figure} if trial.truth is not None else set()) | (
+            {"lpips"} if self.lpips and draws else set()
+        )
         return wanted <= outcome.figures.keys()
 
 
@@ -306,7 +308,7 @@ def refuse_unusable(plan: AblationPlan) -> None:
     plan.workers.ready()
     for data, truth in plan.sets:
         held_out = read(data).held_out
-        if not held_out:
+        if not held_out and truth is None:
             raise BadInput(
                 f"{data.path}: no photograph is kept from training, so rows cannot be compared; see --test-every"
             )
