@@ -31,8 +31,8 @@ class BenchmarkCommand:
 
     Without a name, list the benchmarks. The protocol fixes scenes, splits, sizes, steps, depth maps, crops, thresholds
     and alignment; options only choose rows, scenes and seeds. First, the folder is checked: everything that is missing
-    or wrong is listed at once, with where it comes from, and nothing is trained. An interrupted benchmark continues when
-    the same command is given again.
+    or wrong is listed at once, with where it comes from, and nothing is trained. An interrupted benchmark continues
+    when the same command is given again.
     """
 
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None

@@ -18,8 +18,8 @@ DATA_FILE = "data.json"
 
 
 def data_hash(scene: Scene, files: Sequence[Path], root: Path, out: Path) -> str:
-    """Sixteen hex digits of all that is read of a scene: cameras, sparse points, names and contents of photographs and of
-    their masks, which photographs are held out, and the ground truth.
+    """Sixteen hex digits of all that is read of a scene: cameras, sparse points, names and contents of photographs and
+    of their masks, which photographs are held out, and the ground truth.
 
     Photographs count by size and by three pieces of 64 kB of each, the truth whole. What has the size and the time that
     it had is not read again. Depth maps are not part of it: they are made, and what made them is looked at.

@@ -20,6 +20,9 @@ from surfkit.study.ablation import Row, Table
 MEAN = "mean"
 """In place of the name of a scene: figures over all scenes of a benchmark."""
 
+WORDS = ("about", "sources", "rules", "published_in")
+"""Of a protocol, what decides no figure."""
+
 Figures = Mapping[str, float]
 """Published figures, by the names of `surfkit.study.metric_columns`."""
 
@@ -107,8 +110,11 @@ class Protocol:
 
     @property
     def digest(self) -> str:
-        """Twelve hex digits of the declaration: another one must have another version."""
-        return hashlib.sha256(json.dumps(dump(self), sort_keys=True).encode()).hexdigest()[:12]
+        """Twelve hex digits of the declaration without words and published figures: another one must have another
+        version."""
+        parts = {name: it for name, it in dump(self).items() if name not in WORDS}
+        parts["contenders"] = [(each.label, dump(each.recipe), each.steps) for each in self.contenders]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
     def chosen_scenes(self, names: Sequence[str]) -> tuple[BenchmarkScene, ...]:
         """Those that are named, in the order of the protocol; all if none is.

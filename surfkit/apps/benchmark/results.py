@@ -52,10 +52,12 @@ def report_of(
     ]
     rows += still_valid(protocol, before, rows)
     order = [scene.name for scene in protocol.scenes]
-    rows.sort(key=lambda row: order.index(row["scene"]))
+    rank = {each.label: at for at, each in enumerate(protocol.contenders)}  # other recipes stand below
+    rows.sort(key=lambda row: (order.index(row["scene"]), rank.get(row["recipe"], len(rank))))
     shown = {row["scene"] for row in rows}
     if len(protocol.scenes) > 1:
-        rows += [mean_row(protocol, label, rows) for label in dict.fromkeys(row["recipe"] for row in rows)]
+        means = [mean_row(protocol, label, rows) for label in dict.fromkeys(row["recipe"] for row in rows)]
+        rows += [row for row in means if row["mean"] or row["published"]]
     data = dict(before["data"] if before else {}) | {name: found for name, (found, _) in scenes.items()}
     return {
         "benchmark": protocol.tag,

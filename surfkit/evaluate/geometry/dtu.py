@@ -102,10 +102,11 @@ def read_scale(path: Path) -> np.ndarray:
 def _matlab(path: Path, wanted: dict[str, tuple[int, ...] | None]) -> dict[str, np.ndarray]:
     """Arrays of a MATLAB file by name, of given shapes where they have one."""
     from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
 
     try:
         found = {name: np.asarray(array) for name, array in loadmat(path, variable_names=list(wanted)).items()}
-    except (OSError, ValueError, TypeError, NotImplementedError, EOFError) as error:
+    except (MatReadError, OSError, ValueError, TypeError, NotImplementedError, EOFError) as error:
         raise BadInput(f"{path}: cannot be read as a MATLAB file: {' '.join(str(error).split())}") from error
     for name, shape in wanted.items():
         if name not in found or found[name].dtype.kind not in "buif" or shape not in (None, found[name].shape):
