@@ -130,9 +130,9 @@ def _of_pictures(folder: Path, needed: Needed) -> Iterator[str]:
         except BadInput:
             damaged.append(path.name)
     if small:
-        yield f"{len(small)} pictures are smaller than {needed.longest} px: {few(small)}"
+        yield f"smaller than {needed.longest} px: {len(small)} of {len(pictures)}, {few(small)}"
     if damaged:
-        yield f"{len(damaged)} pictures cannot be read: {few(damaged)}"
+        yield f"cannot be read: {len(damaged)} of {len(pictures)}, {few(damaged)}"
 
 
 def _wrong(count: int, wanted: Count | None, what: str) -> str | None:

@@ -118,7 +118,7 @@ def test_what_is_not_as_it_should_be(root, tiny, tmp_path, capsys, monkeypatch):
     assert tiny_run(folder, tmp_path / "out", "--check") == 2
     said = capsys.readouterr().err
     assert "8 pictures, where there must be 9; it is the photographs, from the page of photographs, https://" in said
-    assert "1 pictures cannot be read: 'view_002.png'" in said
+    assert "cannot be read: 1 of 8, 'view_002.png'" in said
     assert f"{folder}/ground_truth/A.ply: cannot be used: " in said
     assert "20 points, where there must be 100 or more; it is the laser scan, from the page of scans" in said
     assert "6 training photographs, where there must be 7" in said
@@ -130,7 +130,7 @@ def test_small_photographs_are_noticed(root, tiny, tmp_path, capsys, monkeypatch
     scene = replace(tiny.scenes[0], needed=(needed, *tiny.scenes[0].needed[1:]))
     monkeypatch.setitem(protocols.PROTOCOLS, "tiny", replace(tiny, scenes=(scene,)))
     assert tiny_run(root, tmp_path / "out", "--check") == 2
-    assert "9 pictures are smaller than 49 px: 'view_000.png', " in capsys.readouterr().err
+    assert "smaller than 49 px: 9 of 9, 'view_000.png', " in capsys.readouterr().err
 
 
 def test_results_stand_beside_published_figures(done, tiny, root):
