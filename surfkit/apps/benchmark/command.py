@@ -8,12 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.benchmark.check import look
-from surfkit.apps.benchmark.describe import description
+from surfkit.apps.benchmark.benchmark_results import LEGEND, RESULTS_FILE, facts, failures, head_and_cells
+from surfkit.apps.benchmark.folder_check import look
 from surfkit.apps.benchmark.protocol import Protocol
+from surfkit.apps.benchmark.protocol_words import description
 from surfkit.apps.benchmark.protocols import PROTOCOLS, protocol_of
-from surfkit.apps.benchmark.results import LEGEND, RESULTS_FILE, facts, failures, head_and_cells
-from surfkit.apps.benchmark.run import BenchmarkPlan, run
+from surfkit.apps.benchmark.run_benchmark import BenchmarkPlan, run
 from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput, printable
 from surfkit.core.codec import read_json

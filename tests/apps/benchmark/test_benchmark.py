@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit.apps.benchmark import protocols, run
+from surfkit.apps.benchmark import protocols
+from surfkit.apps.benchmark.benchmark_results import report_of
 from surfkit.apps.benchmark.data_record import data_hash
 from surfkit.apps.benchmark.protocols import PROTOCOLS
 from surfkit.cli import main
@@ -177,11 +178,11 @@ def test_another_command_keeps_what_is_there(done, tiny, root, no_training, tmp_
 
 def test_rows_of_another_recipe_or_version_are_not_kept(done, tiny):
     before = json.loads((done / "benchmark.json").read_text())
-    still = run.report_of(tiny, 1, {}, {}, before)["rows"]
+    still = report_of(tiny, 1, {}, {}, before)["rows"]
     assert [row["scene"] for row in still] == ["a", "b", "mean"]
     for change in ({"recipe_digest": "other"}, {"runs": [{**before["rows"][0]["runs"][0], "made": None}]}):
         changed = before | {"rows": [before["rows"][0] | change, before["rows"][1]]}
-        assert [row["scene"] for row in run.report_of(tiny, 1, {}, {}, changed)["rows"]][0] == "b"
+        assert [row["scene"] for row in report_of(tiny, 1, {}, {}, changed)["rows"]][0] == "b"
 
 
 @pytest.mark.parametrize("what", ["A/images/view_003.png", "ground_truth/A.ply", "A/sparse/0/points3D.txt"])

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surfkit.apps.benchmark.check import look
-from surfkit.apps.benchmark.describe import description
+from surfkit.apps.benchmark.folder_check import look
+from surfkit.apps.benchmark.protocol_words import description
 from surfkit.apps.benchmark.protocols import DTU, GAUU_SCENE, MATRIXCITY, PROTOCOLS, SHIBUYA, TANKS_AND_TEMPLES
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of

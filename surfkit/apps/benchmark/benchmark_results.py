@@ -195,7 +195,7 @@ def failures(report: Mapping[str, Any]) -> list[str]:
 
 def markdown(protocol: Protocol, report: Mapping[str, Any]) -> str:
     """The results as a page."""
-    from surfkit.apps.benchmark.describe import description
+    from surfkit.apps.benchmark.protocol_words import description
 
     head, rows = head_and_cells(report)
     marks = ["---", "---", *["---:"] * (len(head) - 2)]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surfkit.apps.benchmark.benchmark_results import RESULTS_FILE, report_of, write_report
 from surfkit.apps.benchmark.data_record import data_hash
 from surfkit.apps.benchmark.protocol import BenchmarkScene, Contender, Protocol
 from surfkit.apps.benchmark.provenance import PROVENANCE_FILE, Provenance, provenance_now
-from surfkit.apps.benchmark.results import RESULTS_FILE, report_of, write_report
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.lock import locked
