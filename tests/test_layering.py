@@ -33,7 +33,7 @@ INSIDE = {
     "train": (".", "refine"),
     "runs": ("execute methods", ".", "blocks", "pipeline run_status"),
     "study": (".", "recipes"),
-    "apps": ("sfm doctor report render texture new", "maps view", "quality", ".", "make"),
+    "apps": ("sfm doctor report render texture new", "maps view", "quality", ".", "make benchmark"),
 }
 """Floors inside a folder; "." is all in it that is not named."""
 LEVEL = {name: level for level, floor in enumerate(FLOORS) for name in floor.split()}

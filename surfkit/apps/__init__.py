@@ -96,6 +96,11 @@ def surfkit_commands():
         "ablate": LazyCommand(
             "surfkit.apps.ablate", "Train every row of an ablation table, and compare the rows.", goes_on=True
         ),
+        "benchmark": LazyCommand(
+            "surfkit.apps.benchmark.command",
+            "Train and measure recipes on a public benchmark, by a fixed protocol.",
+            goes_on=True,
+        ),
         "tables": LazyCommand(
             "surfkit.apps.tables", "List the ablation tables that `surfkit ablate` accepts, or the rows of one."
         ),

@@ -80,10 +80,10 @@ class AblateCommand:
     """Run only these rows, by number or label; finished results of the other rows are shown, too."""
 
     columns: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all that were measured)")] = ()
-    """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, normals_median, normals_p90,
-    roughness_on_truth, roughness, boundary_share, components, non_manifold_edges, crossing_share, triangles,
-    triangles_per_area, points, seconds, cpu_seconds, bytes, peak_memory_bytes, peak_gpu_bytes, fps. lpips is measured
-    only if it is named, and what describes a mesh only with --gt."""
+    """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, accuracy, completeness, chamfer,
+    normals_median, normals_p90, roughness_on_truth, roughness, boundary_share, components, non_manifold_edges,
+    crossing_share, triangles, triangles_per_area, points, seconds, cpu_seconds, bytes, peak_memory_bytes,
+    peak_gpu_bytes, fps. lpips is measured only if it is named, and what describes a mesh only with --gt."""
 
     show: bool = False
     """Run nothing, and write nothing: show what is finished."""

@@ -14,6 +14,8 @@ from surfkit.study.metric_columns import TABLE_COLUMNS
 
 MESH_METRICS = ("triangles", "triangles_per_area", "boundary_share", "components", "non_manifold_edges")
 """What stands in metrics.json under "mesh" by the name of its column."""
+CHAMFER_METRICS = {"accuracy": "accuracy", "completeness": "completeness", "chamfer": "overall"}
+"""What stands in metrics.json under "geometry", "chamfer_dtu", by the name of its column."""
 Figures = Mapping[str, float]
 """Numbers of a run, by the names in `TABLE_COLUMNS`."""
 
@@ -48,7 +50,9 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
     known |= surface_figures(geometry, mesh)
     known |= {name: images.get(name) for name in ("psnr", "ssim", "psnr_aligned", "ssim_aligned")}
     known["lpips"] = images.get("lpips_alex")  # AlexNet, as in CityGaussianV2's released code
-    needed = {"seconds", "cpu_seconds"} | (set() if "not_measured" in images else {"psnr", "ssim"})
+    needed = {"seconds", "cpu_seconds"}
+    if "not_measured" not in images and images.get("per_image") != {}:  # {}: no photograph was held out
+        needed |= {"psnr", "ssim"}
     needed |= set() if "points" in known and known["points"] is None else {"points"}
     wanted = [name for name in TABLE_COLUMNS if name in needed or known.get(name) is not None]
     found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
@@ -72,6 +76,7 @@ def surface_figures(geometry: Mapping[str, Any], mesh: Mapping[str, Any]) -> dic
 
     return {
         **{name: geometry.get(name) for name in ("precision", "recall", "f1")},
+        **{name: part(geometry, "chamfer_dtu").get(told) for name, told in CHAMFER_METRICS.items()},
         **{f"normals_{name}": part(geometry, "normals").get(name) for name in ("median", "p90")},
         "roughness_on_truth": part(geometry, "roughness").get("on_truth_planes"),
         **{name: mesh.get(name) for name in MESH_METRICS},

@@ -135,9 +135,9 @@ def train(work: TrialJob) -> dict[str, Any]:
 
 
 def measured(work: TrialJob, found: dict[str, int | float]) -> dict[str, int | float]:
-    """The numbers of a finished run, with F1 and LPIPS where they are wanted."""
+    """The numbers of a finished run, with those of its mesh and LPIPS where they are wanted."""
     trial, compressed = work.trial, work.trial.recipe.compress is not None
-    if trial.truth is not None and "f1" not in found:
+    if trial.truth is not None and trial.truth.figure not in found:
         found = figures(trial.truth.measure(trial.folder, work.out, work.device), compressed)
     if work.lpips and "lpips" not in found and "psnr" in found:
         again = figures(measure_lpips(trial.folder, work.device), compressed)

@@ -124,8 +124,9 @@ class AblationPlan:
         """Whether all that is wanted of a trial was measured."""
         if outcome.figures is None:
             return False
-        draws = "psnr" in outcome.figures  # a mesher alone draws no pictures that LPIPS could be measured on
-        wanted = ({"f1"} if trial.truth is not None else set()) | ({"lpips"} if self.lpips and draws else set())
+        wanted = {trial.truth.figure} if trial.truth is not None else set()
+        if self.lpips and "psnr" in outcome.figures:  # a mesher alone draws no pictures to measure it on
+            wanted |= {"lpips"}
         return wanted <= outcome.figures.keys()
 
 
@@ -306,10 +307,9 @@ def refuse_unusable(plan: AblationPlan) -> None:
     plan.workers.ready()
     for data, truth in plan.sets:
         held_out = read(data).held_out
-        if not held_out:
-            raise BadInput(
-                f"{data.path}: no photograph is kept from training, so rows cannot be compared; see --test-every"
-            )
+        if not held_out and truth is None:
+            told = "no photograph is kept from training, so rows cannot be compared; see --test-every"
+            raise BadInput(f"{data.path}: {told}")
         if truth is not None:
             truth.refuse_unusable()
             for mesh in plan.meshes:

@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import dump, read_json, write_json
 from surfkit.evaluate.geometry.comparison import Comparison, truth_side
 from surfkit.evaluate.geometry.measure_geometry import measure_geometry
 from surfkit.evaluate.geometry.surface_file import read_surface
@@ -20,6 +20,9 @@ from surfkit.runs.pipeline import loaded, mesh, opened
 from surfkit.runs.resume import read_unchanged
 from surfkit.scene.scene import Scene
 
+PLAIN = Comparison(classes=False)
+"""How the rows of an ablation table are compared."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -28,10 +31,18 @@ class Truth:
     Attributes:
         path: A mesh, or a cloud of points.
         tau: Distance below which a point counts as right; None for what the spacing of a cloud gives.
+        comparison: How they are compared, but for tau.
+        shares_crop: Whether all meshes are compared in the volume of the first. If not, each has the volume that the
+            views give, as high as the mesh itself: what comes out does not depend on what was measured before.
     """
+
+    figure: ClassVar[str] = "f1"
+    """Name of the number that a mesh has once it is compared."""
 
     path: Path
     tau: float | None = None
+    comparison: Comparison = PLAIN
+    shares_crop: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", self.path.resolve())
@@ -40,7 +51,7 @@ class Truth:
     @property
     def settings(self) -> Comparison:
         """How meshes are compared."""
-        return Comparison(tau=self.tau, classes=False)
+        return replace(self.comparison, tau=self.tau)
 
     def refuse_unusable(self) -> None:
         """BadInput for a file that no mesh could be compared with."""
@@ -68,8 +79,16 @@ class Truth:
         own = metrics.get("compressed") or {} if compressed else metrics
         geometry = own.get("geometry") or {}
         made = geometry.get("table")
-        is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
+        if not isinstance(made, dict) or self.stamp not in (None, made.get("truth")):
+            return False
+        is_same = {name: it for name, it in made.items() if name != "truth"} == self._record
         return geometry.get("truth") == str(self.path) and is_same and "mesh" in own  # older versions have none
+
+    @property
+    def _record(self) -> dict[str, Any]:
+        """Plain data by which figures that were measured otherwise are noticed."""
+        other = {} if self.comparison == PLAIN else {"comparison": dump(self.comparison)}
+        return {"tau": self.tau, **other, **({} if self.shares_crop else {"shares_crop": False})}
 
     def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
@@ -106,10 +125,11 @@ class Truth:
             BadInput: The mesh is nowhere near the truth.
         """
         crop = self.crop(out)
-        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
+        is_known = self.shares_crop and crop.exists()
+        settings = replace(self.settings, crop=str(crop)) if is_known else self.settings
         found = measure_geometry((mesh, self.path), settings, folder, scene.train, scene.frame)
-        found["geometry"]["table"] = {"tau": self.tau, "truth": self.stamp}
-        if not crop.exists():
+        found["geometry"]["table"] = {**self._record, "truth": self.stamp}
+        if self.shares_crop and not crop.exists():
             write_json(crop, read_json(folder / "crop.json", Any))
         return found
 

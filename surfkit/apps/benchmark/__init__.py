@@ -1,0 +1,1 @@
+"""Locked benchmarks: `surfkit benchmark`."""
