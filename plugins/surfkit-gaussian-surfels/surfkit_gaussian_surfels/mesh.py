@@ -81,10 +81,8 @@ def weight_around(points: Tensor, splats: Splats, side: float) -> Tensor:
     counts = discs.columns().prod(1)
     order = counts.argsort(stable=True)  # small ones together, so that a group is of many small or few large
     for group in split_by(counts[order].cumsum(0), MOST_COLUMNS):
-        keys, weights = discs.take(order[group]).cells()
-        at = torch.searchsorted(wanted, keys).clamp_max(len(wanted) - 1)
-        met = wanted[at] == keys
-        total.index_add_(0, at[met], weights[met].double())
+        at, weights = discs.take(order[group]).cells(wanted)
+        total.index_add_(0, at, weights.double())
     return total[of_point].to(points)
 
 
@@ -155,8 +153,9 @@ class Discs:
         middle = self.centres.gather(1, self.order[:, :2])
         return (middle - half).floor().long(), (middle + half).floor().long()
 
-    def cells(self) -> tuple[Tensor, Tensor]:
-        """Keys (C,) int64 of the cells that they meet, each as often as there are discs that do, and (C,) weights."""
+    def cells(self, wanted: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (C,) int64 among (K,) sorted keys of the cells that they meet, each as often as there are discs that
+        do, and (C,) weights."""
         (low, _), size = self.ends(), self.columns()
         count = size.prod(1)
         row = torch.arange(len(count)).repeat_interleave(count)
@@ -171,14 +170,17 @@ class Discs:
         first, last = (middle - rise).floor().long(), (middle + rise).floor().long()
         found = []
         for step in range(3):
-            meets = first + step <= last
-            cell = torch.cat([across, (first + step)[:, None]], 1)[meets]
-            of = row[meets]
-            place = torch.empty_like(cell).scatter_(1, self.order[of], cell)
+            meets = (first + step <= last).nonzero()[:, 0]
+            cell = torch.cat([across[meets], (first[meets] + step)[:, None]], 1)
+            place = torch.empty_like(cell).scatter_(1, self.order[row[meets]], cell)
+            key = key_of(place)
+            at = torch.searchsorted(wanted, key).clamp_max(len(wanted) - 1)
+            known = (wanted[at] == key).nonzero()[:, 0]  # most cells have no points
+            at, of, place = at[known], row[meets[known]], place[known]
             nearest = torch.minimum(torch.maximum(self.centres[of], place.to(self.centres)), place + 1.0)
             along = torch.einsum("ni,nij->nj", nearest - self.centres[of], self.axes[of]) / self.scales[of]
             square = along.square().sum(1)
             inside = square <= REACH**2
-            found.append((key_of(place[inside]), (self.opacities[of] * torch.exp(-square / 2))[inside]))
-        keys, weights = zip(*found, strict=True)
-        return torch.cat(keys), torch.cat(weights)
+            found.append((at[inside], (self.opacities[of] * torch.exp(-square / 2))[inside]))
+        places, weights = zip(*found, strict=True)
+        return torch.cat(places), torch.cat(weights)
