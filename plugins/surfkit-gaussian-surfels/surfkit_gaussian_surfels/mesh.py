@@ -1,4 +1,4 @@
-"""Volumetric cutting: Poisson reconstruction of the depth that splats are near (Dai et al. 2024, section on meshing)."""
+"""Volumetric cutting: Poisson reconstruction of the depth that splats are near (Dai et al. 2024)."""
 
 from __future__ import annotations
 
@@ -154,8 +154,8 @@ class Discs:
         return (middle - half).floor().long(), (middle + half).floor().long()
 
     def cells(self, wanted: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (C,) int64 among (K,) sorted keys of the cells that they meet, each as often as there are discs that
-        do, and (C,) weights."""
+        """Positions (C,) int64 among (K,) sorted keys of the cells that they meet, each as often as discs do, and (C,)
+        weights."""
         (low, _), size = self.ends(), self.columns()
         count = size.prod(1)
         row = torch.arange(len(count)).repeat_interleave(count)

@@ -86,7 +86,7 @@ def test_a_thin_ellipsoid_differs_by_the_square_of_its_thickness():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4, -0.9])
 def test_the_depth_is_that_of_the_plane_to_first_order(tilt):
-    """The inverse depth of a plane is linear in the pixel: 1 / z = (1 - t) / z_c where the first order is z_c (1 + t)."""
+    """A plane's inverse depth is linear in the pixel: 1 / z = (1 - t) / z_c where the first order is z_c (1 + t)."""
     splats = disc(tilt, NO_THICKNESS, size=0.05)
     depth, there = rendered(splats)
     plane, centre = plane_depth(splats, CAMERA), splats.means[0, 2]
@@ -126,7 +126,8 @@ def test_the_third_scale_is_pinned_and_no_gradient_moves_it():
     grads = torch.autograd.grad([made[n] for n in names], list(leaves.values()), [given[n] for n in names],
                                 allow_unused=True)  # fmt: skip
     stepped = {
-        name: value - 0.1 * (0 if grad is None else grad) for (name, value), grad in zip(params.items(), grads, strict=True)
+        name: value - 0.1 * (0 if grad is None else grad)
+        for (name, value), grad in zip(params.items(), grads, strict=True)
     }
     assert not torch.equal(stepped["scales"], params["scales"])
     for each in (params, stepped, primitive.split(stepped, generator)):

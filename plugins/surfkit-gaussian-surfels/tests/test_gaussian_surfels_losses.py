@@ -39,7 +39,8 @@ def test_consistency_and_curvature_are_zero_on_a_plane(alpha):
 def test_consistency_is_one_minus_the_cosine():
     maps, angle = plane_maps(), 0.4
     normal = maps.need("normal")
-    aside = torch.nn.functional.normalize(torch.linalg.cross(normal, torch.tensor([0, 1.0, 0]).double()[:, None, None].expand(3, 24, 32), dim=0), dim=0)
+    upward = torch.tensor([0, 1.0, 0]).double()[:, None, None].expand(3, 24, 32)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(normal, upward, dim=0), dim=0)
     tilted = replace(maps, normal=math.cos(angle) * normal + math.sin(angle) * aside)
     assert float(NormalDepthConsistency()(tilted, TARGET)) == pytest.approx(1 - math.cos(angle), rel=1e-9)
 
@@ -100,7 +101,9 @@ def test_weights_are_those_of_the_paper():
     assert at[1]["normal-prior"] == pytest.approx(0.04, rel=1e-3) and at[15_000]["normal-prior"] == pytest.approx(0.02)
     assert at[1]["curvature"] == at[15_000]["curvature"] == 0.005
     assert stage.regularizers["opacity"].weight_at(1, 15_000) == 0.01
-    assert stage.densify.cull_opacity == 0.1 and stage.densify.reset_opacity == 0.12 and stage.densify.reset_every == 1_000
+    assert (
+        stage.densify.cull_opacity == 0.1 and stage.densify.reset_opacity == 0.12 and stage.densify.reset_every == 1_000
+    )
     assert rescale(stage, 0.1).weights_at(750)["consistency"] == pytest.approx(0.11)
 
 

@@ -44,7 +44,7 @@ def scattered(count: int, side: float) -> Splats:
 
 
 def by_a_loop(points: torch.Tensor, splats: Splats, side: float) -> torch.Tensor:
-    """(P,) weights: every disc and every cell, the plane against the cell's corners, the box around 3 sigma against it."""
+    """(P,) weights: every disc and every cell, whose corners lie on both sides of the plane, within the 3 sigma box."""
     corner, total = points.amin(0).double(), {}
     wanted = {tuple(cell) for cell in ((points.double() - corner) / side).floor().long().tolist()}
     for at in range(len(splats)):
@@ -84,7 +84,9 @@ def test_a_splat_in_few_groups_or_many_is_the_same(monkeypatch):
 def edge() -> tuple[Splats, torch.Tensor, torch.Tensor]:
     """Two opaque walls, at z = 0 and z = 1, a faint splat between their edges, and the points of depth maps: on both
     walls, and between them, where the mean depth of a pixel lies."""
-    y, x = (grid.flatten() for grid in torch.meshgrid(torch.linspace(0, 1, 21), torch.linspace(0, 1, 21), indexing="ij"))
+    y, x = (
+        grid.flatten() for grid in torch.meshgrid(torch.linspace(0, 1, 21), torch.linspace(0, 1, 21), indexing="ij")
+    )
     near, far = (torch.stack([x * 0.5 + shift, y, torch.full_like(x, z)], 1) for shift, z in ((0.0, 0.0), (0.5, 1.0)))
     means = torch.cat([near, far, torch.tensor([[0.5, 0.5, 0.5]])])
     upright = torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1)
