@@ -50,6 +50,7 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
@@ -62,6 +63,7 @@ from surfkit.io.splats.file_axes import FileAxes
 from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.reprojection import Reprojection
@@ -71,6 +73,7 @@ from surfkit.losses.warped_patches import WarpedPatches
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.isosurface import isosurface
 from surfkit.mesh.overlap import Depths
+from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.trust import Trust
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import Assign
@@ -88,6 +91,7 @@ from surfkit.primitives.storage import Storage
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
+from surfkit.raster.normals import normals_of
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 from surfkit.runs.recipe import Recipe
@@ -188,16 +192,19 @@ __all__ = [
     "Neighbour",
     "NewPoints",
     "NormalConsistency",
+    "NormalPrior",
     "Observations",
     "Optimizer",
     "OptimizerInput",
     "Partition",
+    "PatchMatch",
     "PhotoLight",
     "PhotoSkipped",
     "Pixels",
     "Plan",
     "Points",
     "PointsEdited",
+    "Poisson",
     "Policy",
     "Primitive",
     "Progress",
@@ -268,6 +275,7 @@ __all__ = [
     "load",
     "log_linear",
     "name_of",
+    "normals_of",
     "read_json",
     "reject",
     "replacing",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Literal
 
@@ -60,9 +60,16 @@ class Poisson(Mesher):
         share = -(-self.points // len(subject.views))
         found = [seen_pixels(subject, at, share, self.depth) for at in range(len(subject.views))]
         points, normals, colors = (torch.cat([getattr(p, n) for p in found]) for n in ("points", "normals", "colors"))
+        kept, count = self.kept(subject, points), len(points)
+        points, normals, colors = points[kept], normals[kept], colors[kept]
         if len(points) < MIN_ORIENTED_POINTS:
             raise BadInput(f"mesh: only {len(points)} pixels of {len(subject.views)} views have a depth; train longer")
-        return reconstructed(points, normals, colors, self.octree, self.thin, "mesh:poisson")
+        made = reconstructed(points, normals, colors, self.octree, self.thin, "mesh:poisson")
+        return replace(made, facts={"points": count, "points_kept": len(points)})
+
+    def kept(self, subject: MeshInput, points: Tensor) -> Tensor:
+        """(P,) bool, which of the (P, 3) points of all views lie on a surface; by default all, for other meshers."""
+        return torch.ones_like(points[:, 0], dtype=torch.bool)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
 from surfkit.scene.scene import SparsePoints
 
+NO_THICKNESS = 1e-20
+"""Third scale of thickness 0, local units: no rounding shows its square beside those of the others, while
+rasterizers, and files of splats, which hold logarithms, need one above 0."""
+
 
 @dataclass(frozen=True)
 class Flat3D(Primitive):
@@ -25,15 +29,16 @@ class Flat3D(Primitive):
     """
 
     thickness: float = 1e-3
-    """Third scale as a share of the smaller of the other two."""
+    """Third scale as a share of the smaller of the other two; 0 makes planes, whose depth at a pixel is that of the
+    plane to first order."""
 
     antialias: bool = False
     """Dim splats smaller than a pixel by what the 0.3 px blur adds to them."""
 
     def __post_init__(self) -> None:
         Primitive.__post_init__(self)
-        if not 0 < self.thickness < 1:
-            raise BadInput(f"primitive.thickness is {self.thickness}; it must lie between 0 and 1")
+        if not 0 <= self.thickness < 1:
+            raise BadInput(f"primitive.thickness is {self.thickness}; it must be 0 or more and below 1")
 
     def columns(self) -> dict[str, Column]:
         """The standard ones."""
@@ -60,4 +65,5 @@ class Flat3D(Primitive):
     def _three(self, raw: Tensor) -> Tensor:
         """(N, 3) scales from two raw ones."""
         two = raw.exp()
-        return torch.cat([two, self.thickness * two.detach().amin(-1, keepdim=True)], dim=-1)
+        third = self.thickness * two.detach().amin(-1, keepdim=True)
+        return torch.cat([two, third.clamp_min(NO_THICKNESS)], dim=-1)

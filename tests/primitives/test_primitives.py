@@ -87,8 +87,11 @@ def test_flat_gaussians_stay_flat():
     params["scales"][:, 0] += 2
     scales = Flat3D(thickness=0.01).activate(params, 0).scales
     assert torch.allclose(scales[:, 2], 0.01 * scales[:, 1]) and (scales.argmin(-1) == 2).all()
-    with pytest.raises(BadInput, match="thickness is 1.5"):
-        Flat3D(thickness=1.5)
+    planes = Flat3D(thickness=0.0).activate(params, 0).scales
+    assert (planes[:, 2] > 0).all() and (planes[:, 2] ** 2 + planes[:, 1] ** 2 == planes[:, 1] ** 2).all()
+    for wrong in (1.5, -0.1):
+        with pytest.raises(BadInput, match=f"thickness is {wrong}"):
+            Flat3D(thickness=wrong)
 
 
 @pytest.mark.parametrize("primitive", [Surfel2D(), Flat3D()], **names)
