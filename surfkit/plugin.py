@@ -90,7 +90,7 @@ from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Spl
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, refuse_unfit_stage
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.pixels import Pixels
@@ -98,10 +98,14 @@ from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
+from surfkit.train import checkpoint
+from surfkit.train.faults import Diverged
 from surfkit.train.interrupt import graceful
 from surfkit.train.optimizer import Optimizer, OptimizerInput
 from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
+from surfkit.train.trainer import CompletedStep, Trainer
 
 __all__ = [
     "ADC",
@@ -120,6 +124,7 @@ __all__ = [
     "ColumnType",
     "Columns",
     "Component",
+    "CompletedStep",
     "Compressor",
     "Contraction",
     "Contribution",
@@ -137,6 +142,7 @@ __all__ = [
     "Derived",
     "DerivedRender",
     "Distortion",
+    "Diverged",
     "EXP",
     "Edit",
     "Encoding",
@@ -229,6 +235,7 @@ __all__ = [
     "Stage",
     "StageBegan",
     "StageEnded",
+    "StageState",
     "Start",
     "StartInput",
     "Step",
@@ -243,6 +250,7 @@ __all__ = [
     "Target",
     "Tile",
     "Tracks",
+    "Trainer",
     "Transients",
     "Trust",
     "View",
@@ -252,6 +260,7 @@ __all__ = [
     "WarpedPatches",
     "admitted",
     "camera_of",
+    "checkpoint",
     "choice",
     "components",
     "dump",
@@ -269,6 +278,7 @@ __all__ = [
     "log_linear",
     "name_of",
     "read_json",
+    "refuse_unfit_stage",
     "reject",
     "replacing",
     "require_within",
