@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -55,9 +54,9 @@ class SplatsWithDistance(Method):
         start.refuse_unfit(primitive, given.scene)
         self.surface.refuse_unfit(given)
 
-    @abstractmethod
     def link(self, surface: Surface) -> Link:
-        """What ties the splats to a surface."""
+        """What ties the splats to a surface; of the form."""
+        raise NotImplementedError
 
     def reconstruct(self, given: MethodInput) -> Reconstruction:
         """See `Method.reconstruct`: the mesh is that of the distance, and pictures are drawn with the splats."""
