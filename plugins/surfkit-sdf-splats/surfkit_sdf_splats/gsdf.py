@@ -18,6 +18,7 @@ from surfkit_neus.box import Rays, camera_rays
 from surfkit_neus.method import Neuralangelo
 from surfkit_neus.render import Drawn, Samples, draw_along
 from surfkit_neus.sampling import even_samples
+from surfkit_octree.anchors import Anchors
 from surfkit_octree.growth import AnchorGrowth
 from surfkit_octree.volume import AnchorVolume
 from torch import Tensor
@@ -31,9 +32,11 @@ from surfkit.plugin import (
     LearningRate,
     Loss,
     Maps,
+    MethodInput,
     Stage,
     Steps,
     Target,
+    name_of,
     require_within,
 )
 from surfkit_sdf_splats.branches import Link, Surface, counted
@@ -265,6 +268,16 @@ class GSDF(SplatsWithDistance):
             raise BadInput("splats.densify is none, and the surface controls the density of splats; choose one")
         if "mutual" in self.splats.losses:
             raise BadInput("splats.losses.mutual: the name is that of the method's own loss; choose another")
+
+    def refuse_unfit(self, given: MethodInput) -> None:
+        """See `Method.refuse_unfit`."""
+        primitive = given.used["primitive"]
+        if isinstance(self.splats.densify, AnchorGrowth) and not isinstance(primitive, Anchors):
+            raise BadInput(
+                f"method.splats.densify: anchor-growth adds anchors only, and the primitive is {name_of(primitive)}; "
+                "choose method.splats.densify:adc with method.splats.regularizers.volume:none, or primitive:anchors"
+            )
+        super().refuse_unfit(given)
 
     def mutual_at(self, index: int) -> tuple[float, float]:
         """Weights of depth and normals in step `index` of the surface."""

@@ -218,7 +218,7 @@ def test_data_and_parts_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(BadInput, match="method.splats"):
         replace(method, splats=replace(method.splats, losses={})).refuse_unfit(given)
     with pytest.raises(BadInput, match="anchors"):
-        train(gsdf(8, densify=AnchorGrowth()), given, scene_box(given.scene, 0.1))
+        gsdf(8, densify=AnchorGrowth()).refuse_unfit(given)
     few = replace(given.scene, cloud=SparsePoints(torch.zeros(3, 3), torch.zeros(3, 3, dtype=torch.uint8)))
     with pytest.raises(BadInput, match="3 sparse points"):
         method.refuse_unfit(replace(given, scene=few))
