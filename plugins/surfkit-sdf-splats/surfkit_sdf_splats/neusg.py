@@ -2,7 +2,7 @@
 
 The words of the paper: "scale regularizer" pulls the centre of a Gaussian to the surface by making it "extremely
 thin"; the point cloud of the Gaussians guides the distance, |f(x)| = 0, and the gradient of the distance refines the
-Gaussians, whose normal is their thinnest axis. The paper prints no code; weights that it leaves open are ours.
+Gaussians, whose normal is their thinnest axis. There is no published code; the weights are ours.
 """
 
 from __future__ import annotations
