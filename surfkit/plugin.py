@@ -94,7 +94,7 @@ from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.normals import normals_of
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
-from surfkit.runs.recipe import Recipe
+from surfkit.runs.recipe import Recipe, refuse_unfit_stage
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.pixels import Pixels
@@ -102,10 +102,14 @@ from surfkit.scene.scene import Frame, Lens, Mask, Scene, SparsePoints, View
 from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
+from surfkit.train import checkpoint
+from surfkit.train.faults import Diverged
 from surfkit.train.interrupt import graceful
 from surfkit.train.optimizer import Optimizer, OptimizerInput
 from surfkit.train.refine.base import Refine
 from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
+from surfkit.train.trainer import CompletedStep, Trainer
 
 __all__ = [
     "ADC",
@@ -124,6 +128,7 @@ __all__ = [
     "ColumnType",
     "Columns",
     "Component",
+    "CompletedStep",
     "Compressor",
     "Contraction",
     "Contribution",
@@ -141,6 +146,7 @@ __all__ = [
     "Derived",
     "DerivedRender",
     "Distortion",
+    "Diverged",
     "EXP",
     "Edit",
     "Encoding",
@@ -236,6 +242,7 @@ __all__ = [
     "Stage",
     "StageBegan",
     "StageEnded",
+    "StageState",
     "Start",
     "StartInput",
     "Step",
@@ -250,6 +257,7 @@ __all__ = [
     "Target",
     "Tile",
     "Tracks",
+    "Trainer",
     "Transients",
     "Trust",
     "View",
@@ -259,6 +267,7 @@ __all__ = [
     "WarpedPatches",
     "admitted",
     "camera_of",
+    "checkpoint",
     "choice",
     "components",
     "dump",
@@ -277,6 +286,7 @@ __all__ = [
     "name_of",
     "normals_of",
     "read_json",
+    "refuse_unfit_stage",
     "reject",
     "replacing",
     "require_within",

@@ -143,7 +143,7 @@ class Recipe:
             except BadInput as error:
                 raise BadInput(f"lod: {error}") from error
         for path, stage, primitive in self.stages():
-            _refuse_unfit_stage(path, stage, primitive)
+            refuse_unfit_stage(path, stage, primitive)
             for key in (key for key, term in stage.regularizers.items() if isinstance(term, Consensus)):
                 self._refuse_consensus(f"{path}.regularizers.{key}", path, stage)
 
@@ -221,7 +221,9 @@ def _refuse_no_loss(path: str, stage: Stage) -> None:
         )
 
 
-def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
+def refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
+    """BadInput if a stage at a path in the recipe does not fit the primitive; a note of learning rates that are not
+    used."""
     _refuse_weights(path, stage)
     _refuse_no_loss(path, stage)
     columns = primitive.columns()

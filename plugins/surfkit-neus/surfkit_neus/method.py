@@ -9,7 +9,18 @@ import torch
 from torch import Tensor
 
 from surfkit.core.memory import size
-from surfkit.plugin import BadInput, Interval, Method, MethodInput, Reconstruction, Steps, Warned, emit, require_within
+from surfkit.plugin import (
+    BadInput,
+    Interval,
+    Mesh,
+    Method,
+    MethodInput,
+    Reconstruction,
+    Steps,
+    Warned,
+    emit,
+    require_within,
+)
 from surfkit_neus.batches import Batch
 from surfkit_neus.box import Rays, SceneBox, scene_box
 from surfkit_neus.field import BackgroundField, Networks, SurfaceField
@@ -162,25 +173,32 @@ class NeuralSurface(Method):
         box = scene_box(given.scene, self.margin)
         state = train(self, given, box)
         look, at_once = self.look(self.steps), DRAWN * self.rays
-        path = given.folder / "mesh.npz"
-        if not path.exists():
-            views = given.scene.train
-            write_mesh(path, field_mesh(state.field, box, views, look, self.cells, self._positions(at_once)))
-        mesh = read_mesh(
-            path, facts={"cells": self.cells, "side": 2 / self.cells * box.scale / given.scene.frame.scale}
-        )
-        if not len(mesh.faces):
-            emit(Warned("the signed distance is 0 nowhere that a view sees, so there is no mesh; train longer"))
 
         def draw_some(rays: Rays) -> Drawn:
             return draw_rays(state.field, state.background, rays, self.samples, look)
 
         return Reconstruction(
-            mesh=mesh if len(mesh.faces) else None,
+            mesh=self.mesh(given, box, state),
             draw=lambda view: draw_view(draw_some, view, box, given.device, at_once),
             facts={"initial_shape": box.shape, "sharpness": state.field.sharpness.item(), "levels": look.levels},
             steps=self.steps,
         )
+
+    def mesh(self, given: MethodInput, box: SceneBox, state: State) -> Mesh | None:
+        """The surface of the trained field, made once and kept in the folder; None, with a warning, without a face."""
+        path = given.folder / "mesh.npz"
+        if not path.exists():
+            at_once = self._positions(DRAWN * self.rays)
+            write_mesh(
+                path, field_mesh(state.field, box, given.scene.train, self.look(self.steps), self.cells, at_once)
+            )
+        mesh = read_mesh(
+            path, facts={"cells": self.cells, "side": 2 / self.cells * box.scale / given.scene.frame.scale}
+        )
+        if len(mesh.faces):
+            return mesh
+        emit(Warned("the signed distance is 0 nowhere that a view sees, so there is no mesh; train longer"))
+        return None
 
 
 @dataclass(frozen=True)

@@ -92,11 +92,24 @@ def draw_rays(
     draw: torch.Generator | None = None,
 ) -> Drawn:
     """Render rays; samples are moved at random if `draw`."""
+    t = even_samples(rays.near, rays.far, samples.even, draw)
+    return draw_along(field, background, rays, t, samples, look, draw)
+
+
+def draw_along(
+    field: SurfaceField,
+    background: BackgroundField,
+    rays: Rays,
+    t: Tensor,
+    samples: Samples,
+    look: Look,
+    draw: torch.Generator | None = None,
+) -> Drawn:
+    """Render rays between given distances (R, N), sorted, to which `samples.surface` are added."""
 
     def distances(t: Tensor) -> Tensor:
         return field(rays.at(t).flatten(0, 1), look.levels)[0].view_as(t)
 
-    t = even_samples(rays.near, rays.far, samples.even, draw)
     t = surface_samples(t, distances, samples.surface, samples.rounds)
     middle, length = 0.5 * (t[:, 1:] + t[:, :-1]), t.diff(dim=1)
     x, view = rays.at(middle).flatten(0, 1), _each(rays.direction, middle.shape[1])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import reduce
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.plugin import Fault, MethodInput, StageBegan, StepDone, emit, graceful
@@ -51,11 +53,25 @@ def train(method: NeuralSurface, given: MethodInput, box: SceneBox) -> State:
 
 def make_step(method: NeuralSurface, state: State, batches: Batches) -> dict[str, float]:
     """Make one optimisation step, and return its weighted losses."""
+    return descend(method, state, batch_losses(method, state, batches))
+
+
+def batch_losses(method: NeuralSurface, state: State, batches: Batches) -> dict[str, Tensor]:
+    """Weighted losses of the batch of the next step."""
     index = state.index + 1
     draw = batches.draw(index)
     batch = batches(draw)
     drawn = draw_rays(state.field, state.background, batch.rays, method.samples, method.look(index), draw)
-    losses = method.losses(state.field, drawn, batch, index)
+    return method.losses(state.field, drawn, batch, index)
+
+
+def descend(method: NeuralSurface, state: State, losses: Mapping[str, Tensor]) -> dict[str, float]:
+    """Make the next optimisation step by the sum of losses, and return them.
+
+    Raises:
+        Fault: They are NaN or Inf.
+    """
+    index = state.index + 1
     told = {name: float(value.detach()) for name, value in losses.items()}
     if not math.isfinite(sum(told.values())):
         raise Fault(
