@@ -105,6 +105,10 @@ class Cut:
     def __len__(self) -> int:
         return len(self.nodes)
 
+    def take(self, rows: Tensor) -> Cut:
+        """Those of a mask (K,) bool."""
+        return Cut(self.nodes[rows], self.parents[rows], self.share[rows])
+
 
 @dataclass(frozen=True)
 class SplatTree(LodTree):
@@ -202,8 +206,9 @@ class SplatTree(LodTree):
         """The splats to draw for a camera: those of its cut, each on the way between its parent and itself."""
         cut = self.cut(camera, pixels, self.levels[0].near)
         device = self.joined.means.device
-        node, parent = (self.joined.take(rows.to(device)) for rows in (cut.nodes, cut.parents))
-        return self.between(cut, node, parent)
+        whole, on_the_way = cut.take(cut.share == 1), cut.take(cut.share < 1)
+        node, parent = (self.joined.take(rows.to(device)) for rows in (on_the_way.nodes, on_the_way.parents))
+        return self.joined.take(whole.nodes.to(device)).and_then(self.between(on_the_way, node, parent))
 
     def between(self, cut: Cut, node: Splats, parent: Splats) -> Splats:
         """(K) splats on the way from the parents of a cut's nodes to these, differentiable (section 4.3).
