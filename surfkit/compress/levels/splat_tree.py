@@ -25,6 +25,8 @@ from surfkit.scene.rotations import numpy_quaternions
 
 BOX_SIGMAS = 3.0
 """How far the box of a leaf reaches beyond its centre, in its largest scale."""
+LEAST_STEP = 1.1
+"""By which a node counts as larger than its children, at least."""
 
 
 def leaf_ends(count: int) -> np.ndarray:
@@ -47,28 +49,26 @@ class NodeBoxes:
 
     Attributes:
         low, high: (K, 3) float32 corners of a box around all leaves below, BOX_SIGMAS standard deviations wide.
+        size: (K,) float32, the longest side of the box, but at least LEAST_STEP times that of the children: where these
+            are as large as their parent, there would be no way between them.
         reach: (K,) float32, how far a splat of the node or below it extends at most beyond its centre.
     """
 
     low: np.ndarray
     high: np.ndarray
+    size: np.ndarray
     reach: np.ndarray
 
-    @property
-    def size(self) -> np.ndarray:
-        """(K,) longest side of each box, never below that of a child."""
-        return (self.high - self.low).max(1)
-
     def granularity(self, rows: np.ndarray, camera: Camera) -> np.ndarray:
-        """(R,) pixels that the longest side of the box of some nodes covers at its nearest place; inf within the box.
+        """(R,) pixels that some nodes cover at the nearest place of their boxes; inf within the box.
 
-        It is never below that of a child: the box of the child is not longer, and not nearer.
+        It is always above that of a child: the child is smaller, and its box not nearer.
         """
         low, high, centre = self.low[rows], self.high[rows], camera.centre.numpy()
         apart = np.maximum(np.maximum(low - centre, centre - high), 0.0)
         distance = np.sqrt((apart * apart).sum(1))
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(distance > 0, (high - low).max(1) * max(camera.fx, camera.fy) / distance, np.inf)
+            return np.where(distance > 0, self.size[rows] * max(camera.fx, camera.fy) / distance, np.inf)
 
 
 def boxes_of(levels: list[Splats]) -> list[NodeBoxes]:
@@ -80,12 +80,14 @@ def boxes_of(levels: list[Splats]) -> list[NodeBoxes]:
         if level == 0:
             means = splats.means.detach().float().cpu().numpy()
             half = np.float32(BOX_SIGMAS) * longest[:, None]
-            found.append(NodeBoxes(means - half, means + half, reach))
+            found.append(NodeBoxes(means - half, means + half, 2 * half[:, 0], reach))
             continue
         below = found[-1]
         starts = leaf_ends(len(levels[0]))[:-1] if level == 1 else np.arange(0, len(below.reach), 2)
         low, high = np.minimum.reduceat(below.low, starts), np.maximum.reduceat(below.high, starts)
-        found.append(NodeBoxes(low, high, np.maximum(reach, np.maximum.reduceat(below.reach, starts))))
+        largest, farthest = (np.maximum.reduceat(each, starts) for each in (below.size, below.reach))
+        size = np.maximum((high - low).max(1), np.float32(LEAST_STEP) * largest)
+        found.append(NodeBoxes(low, high, size, np.maximum(reach, farthest)))
     return found
 
 
