@@ -219,7 +219,9 @@ class InnerNodes:
         model = self.tree.levels[0]
         own, shared = rows[: len(rows) - len(inner)], model.primitive.shared()
         raw = {
-            name: value if name in shared else torch.cat([value[own], leaves.get(name, self.points.params[name][inner])])
+            name: value
+            if name in shared
+            else torch.cat([value[own], leaves.get(name, self.points.params[name][inner])])
             for name, value in model.params.items()
         }
         splats = model.primitive.activate(raw, model.sh_degree)

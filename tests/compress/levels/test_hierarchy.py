@@ -203,7 +203,9 @@ def test_a_picture_does_not_jump_where_a_node_takes_over():
     jumps, hard = [], []
     for size in np.unique(sizes)[::7]:
         below, above = size * (1 - 1e-6), size * (1 + 1e-6)
-        jumps.append(float((drawn(tree.seen(camera, below), camera) - drawn(tree.seen(camera, above), camera)).abs().max()))
+        jumps.append(
+            float((drawn(tree.seen(camera, below), camera) - drawn(tree.seen(camera, above), camera)).abs().max())
+        )
         cuts = [tree.joined.take(tree.cut(camera, pixels).nodes) for pixels in (below, above)]
         hard.append(float((drawn(cuts[0], camera) - drawn(cuts[1], camera)).abs().max()))
     assert max(jumps) < 6e-3, "some alpha falls below 1/255, and no more"
@@ -213,20 +215,18 @@ def test_a_picture_does_not_jump_where_a_node_takes_over():
 def test_a_camera_that_moves_away_sees_no_jump():
     """Between neighbouring frames the picture changes as that of the full model does, and not by whole nodes."""
     tree = merged_tree(scattered(200, opacity=0.6), 16)
-    path = [looking(distance) for distance in np.linspace(2.0, 2.03, 41)]
-    shown = [drawn(tree.seen(camera, 14.0), camera) for camera in path]
-    hard = [drawn(tree.joined.take(tree.cut(camera, 14.0).nodes), camera) for camera in path]
+    path = [looking(distance) for distance in np.linspace(2.0, 2.1, 41)]
+    shown = [drawn(tree.seen(camera, 35.0), camera) for camera in path]
+    hard = [drawn(tree.joined.take(tree.cut(camera, 35.0).nodes), camera) for camera in path]
     smooth, popping = ([psnr(a, b) for a, b in zip(f[:-1], f[1:], strict=True)] for f in (shown, hard))
-    assert min(smooth) > min(popping) + 6
-    assert len({len(tree.cut(camera, 14.0)) for camera in path}) > 3, "nodes take over on the way"
+    assert min(smooth) > min(popping) + 12
+    assert len({len(tree.cut(camera, 35.0)) for camera in path}) > 3, "nodes take over on the way"
 
 
 def test_blocks_that_are_joined_lose_no_leaf():
     parts = [scattered(37, seed=1), scattered(90, seed=2)]
     trees = [merged_tree(part, 8) for part in parts]
-    joined = replace(
-        parts[0], params={n: torch.cat([part.params[n] for part in parts]) for n in parts[0].params}
-    )
+    joined = replace(parts[0], params={n: torch.cat([part.params[n] for part in parts]) for n in parts[0].params})
     tree = merged_tree(joined, 8)
     assert np.array_equal(np.sort(tree.order), np.arange(127))
     leaves = [{tuple(row) for row in each.levels[0].params["means"].tolist()} for each in (*trees, tree)]
@@ -242,7 +242,9 @@ def test_optimisation_lowers_the_loss_at_every_granularity_and_leaves_the_leaves
     for name, value in plain.levels[0].params.items():
         assert torch.equal(value, taught.levels[0].params[name]), "leaves are anchors"
     for name in ("means", "quats"):
-        assert all(torch.equal(a.params[name], b.params[name]) for a, b in zip(plain.levels, taught.levels, strict=True))
+        assert all(
+            torch.equal(a.params[name], b.params[name]) for a, b in zip(plain.levels, taught.levels, strict=True)
+        )
     wanted = [drawn(given.model.splats, view.camera) for view in given.views]
     for granularity in (0.2, 0.3, 0.4, 0.6, 0.8):
         loss = []
