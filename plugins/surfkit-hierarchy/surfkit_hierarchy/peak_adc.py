@@ -14,19 +14,19 @@ PEAK_STAT = "peak-adc/grad"
 class PeakADC(ADC):
     """Clone and split points whose screen-space gradient is high in any one view (Hierarchical 3DGS, section 3).
 
-    The mean over the views, as 3DGS has it, is low for what many views show from afar and few from near, such as façades
-    in a survey of a whole city; the largest is high where one view lacks detail. All else is as in `adc`.
+    The mean over the views, as 3DGS has it, is low for what many views show from afar and few from near; the largest is
+    high where one view lacks detail. All else is as in `adc`.
     """
 
     threshold: float = 0.015
-    """Largest length of the gradient in a view since the last edit, above which a point is densified, in units of half the
-    image size."""
+    """Largest length of the gradient in a view since the last edit, from which on a point is densified, in units of half
+    the image size."""
 
     small: float = 1e-4
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
 
     every: Annotated[int, StepCount(floor=100, stretch=30.0)] = 300
-    """Steps between edits; short runs keep at least 100, but no more than a few edits may be left out by that."""
+    """Steps between edits; short runs keep at least 100, but no more than 30 times their share of the run."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

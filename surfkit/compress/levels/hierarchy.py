@@ -86,7 +86,7 @@ class Hierarchy(LevelsOfDetail):
         return self.optimised(given, tree) if self.steps else tree
 
     def optimised(self, given: LodInput, tree: SplatTree) -> SplatTree:
-        """The tree after the optimisation of its inner nodes (section 5); as it was, with a warning, if that diverges."""
+        """The tree after the optimisation of its inner nodes (section 5); as it was, with a warning, if it diverges."""
         pictures = renders(given, given.views)
         generator = torch.Generator().manual_seed(given.seed)
         inner, views = InnerNodes.of(tree), given.views

@@ -1,8 +1,8 @@
 """A binary tree of splats, cut by size on the screen (Kerbl et al. 2024, A Hierarchical 3D Gaussian Representation).
 
-The leaves are the splats of a model, in an order in which every node has neighbours below it. A level is one depth of the
-tree, so who is whose parent follows from the number of leaves: node i has children 2i and 2i + 1 of the level below, and
-the nodes of level 1 have one or two leaves each.
+The leaves are the splats of a model, in an order in which every node has neighbours below it. A level is one depth of
+the tree, so who is whose parent follows from the number of leaves: node i has children 2i and 2i + 1 of the level below,
+and the nodes of level 1 have one or two leaves each.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def leaf_ends(count: int) -> np.ndarray:
 
 
 def level_sizes(count: int) -> list[int]:
-    """Nodes of each level above `count` leaves, those first: each has half of the one before, and the last is the root."""
+    """Nodes of each level of a tree with `count` leaves, those first, the root last; each has at most those before."""
     depth = depth_for(count, 2)
     return [count, *(2**left for left in range(depth, -1, -1))]
 
@@ -241,11 +241,14 @@ class SplatTree(LodTree):
 
 
 def turned(splats: Splats, turns: Tensor) -> tuple[Tensor, Tensor]:
-    """The same ellipsoids with other axes called first, second and third: unit quaternions (K, 4) and scales (K, 2 or 3).
+    """The same ellipsoids with other axes called first, second and third.
 
     Args:
         splats: K of them.
         turns: (K,) int64 places in `AXIS_TURNS`.
+
+    Returns:
+        (K, 4) unit quaternions, and (K, 2 or 3) scales.
     """
     by = AXIS_TURNS.to(splats.quats)[turns]
     width = splats.scales.shape[1]
