@@ -19,8 +19,8 @@ class PeakADC(ADC):
     """
 
     threshold: float = 0.015
-    """Largest length of the gradient in a view since the last edit, from which on a point is densified, in units of half
-    the image size."""
+    """Largest length of the gradient in a view since the last edit, from which on a point is densified, in units of
+    half the image size."""
 
     small: float = 1e-4
     """Largest scale that is cloned rather than split, as a share of the scene extent."""

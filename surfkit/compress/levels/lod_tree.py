@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from surfkit.raster.api import CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
+Tree = TypeVar("Tree", bound="LodTree")
 BLOCK_MARGIN_PX = 3.0
 """Around an image when blocks outside are left out: splats smaller than a pixel are drawn with up to this radius."""
 
@@ -172,7 +173,7 @@ class LodTree:
         return None
 
     @classmethod
-    def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> LodTree:
+    def of(cls: type[Tree], order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> Tree:
         """The tree of a list of blocks, the root first and parents before children.
 
         Boxes are found, and the errors of parents are raised to those of their children. `order`: (N,) of the points of

@@ -1,8 +1,8 @@
 """A binary tree of splats, cut by size on the screen (Kerbl et al. 2024, A Hierarchical 3D Gaussian Representation).
 
 The leaves are the splats of a model, in an order in which every node has neighbours below it. A level is one depth of
-the tree, so who is whose parent follows from the number of leaves: node i has children 2i and 2i + 1 of the level below,
-and the nodes of level 1 have one or two leaves each.
+the tree, so who is whose parent follows from the number of leaves: node i has children 2i and 2i + 1 of the level
+below, and the nodes of level 1 have one or two leaves each.
 """
 
 from __future__ import annotations

@@ -247,7 +247,7 @@ def test_a_tree_of_splats_is_read_as_one_and_drawn_along_a_path(copy, capsys, tm
         camera = ctx.scene.train[0].camera
     assert isinstance(tree, SplatTree)
     assert 1 < len(tree.seen(camera, 20.0)) < len(tree.seen(camera, 0.0)) <= 300
-    assert len(tree.seen(camera, 1e9)) == 1
+    assert len(tree.seen(camera, 1e9)) < len(tree.seen(camera, 20.0)), "a camera within the scene"
     for pixels in ("0", "20"):
         out = tmp_path / pixels
         words = ["render", str(copy), "--lod", "--lod-pixels", pixels, "--seconds", "0.1", "--out", str(out)]
