@@ -135,7 +135,7 @@ def tiles(boxes: Sequence[NodeBoxes], ends: np.ndarray) -> list[LodBlock]:
 
     Args:
         boxes: Of the nodes of each level; the error of a block is its largest node, and that of leaves is 0.
-        ends: (2^d + 1,) bounds of the blocks of leaves.
+        ends: (B + 1,) bounds of the blocks of leaves, of which there are 2^d.
     """
     limits, errors = [ends], [np.zeros(len(ends) - 1)]
     for box in boxes[1:]:

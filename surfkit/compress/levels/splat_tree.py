@@ -30,7 +30,7 @@ LEAST_STEP = 1.1
 
 
 def leaf_ends(count: int) -> np.ndarray:
-    """(2^d + 1,) bounds of the leaves of each node of level 1, of `count` leaves: one or two each."""
+    """(B + 1,) bounds of the leaves of each of the B nodes of level 1, of `count` leaves: one or two each."""
     ends = np.array([0, count])
     for _ in range(depth_for(count, 2)):
         ends = halves(ends)
