@@ -6,10 +6,12 @@ One name, one import: `from surfkit.plugin import Loss, Target, hookimpl`. `surf
 from __future__ import annotations
 
 from surfkit.appearance.base import Appearance, PhotoLight
+from surfkit.appearance.exposure import Exposure
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, Find, MatchInput
 from surfkit.compress.base import Compressor, Plan
 from surfkit.compress.encoding import ColumnType, Encoding
 from surfkit.compress.levels.base import LevelsOfDetail, LodInput
+from surfkit.compress.levels.hierarchy import Hierarchy
 from surfkit.compress.levels.lod_tree import LodBlock, LodBlocks, LodTree
 from surfkit.compress.octree import Leaf
 from surfkit.compress.streams import Stored
@@ -79,6 +81,8 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import Assign
 from surfkit.partition.base import Cells, CoarseModel, Contraction, Ground, Partition
 from surfkit.partition.grid import QuantileGrid
+from surfkit.partition.sparse_points import SparsePointShare
+from surfkit.partition.square_grid import SquareGrid
 from surfkit.primitives.base import Primitive, harmonics, rotated
 from surfkit.primitives.columns import EXP, IDENTITY, SIGMOID, Activation, Column, standard_columns
 from surfkit.primitives.edit import Edit, NewPoints
@@ -103,6 +107,7 @@ from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
 from surfkit.train import checkpoint
+from surfkit.train.adam import AdamInView
 from surfkit.train.faults import Diverged
 from surfkit.train.interrupt import graceful
 from surfkit.train.optimizer import Optimizer, OptimizerInput
@@ -115,6 +120,7 @@ __all__ = [
     "ADC",
     "AbsGradient",
     "Activation",
+    "AdamInView",
     "Appearance",
     "Assign",
     "AutogradRender",
@@ -123,6 +129,7 @@ __all__ = [
     "RawDataset",
     "Cells",
     "SparsePoints",
+    "SparsePointShare",
     "CoarseModel",
     "Column",
     "ColumnType",
@@ -152,6 +159,7 @@ __all__ = [
     "Encoding",
     "Estimate",
     "Executor",
+    "Exposure",
     "Fault",
     "FeatureExtractor",
     "FeatureMatcher",
@@ -166,6 +174,7 @@ __all__ = [
     "Gaussian3D",
     "Gradients",
     "Ground",
+    "Hierarchy",
     "IDENTITY",
     "InitialModel",
     "Interval",
@@ -239,6 +248,7 @@ __all__ = [
     "SplatTable",
     "Splats",
     "Split",
+    "SquareGrid",
     "Stage",
     "StageBegan",
     "StageEnded",

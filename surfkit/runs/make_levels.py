@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 
 from surfkit.compress.levels.base import LevelsOfDetail, LodInput
 from surfkit.compress.levels.lod_tree import LodBlocks, LodTree
+from surfkit.compress.levels.splat_tree import SplatTree
 from surfkit.compress.levels.validate_levels import fault
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, read_keys, write_json
@@ -40,6 +41,8 @@ from surfkit.scene.scene import Scene, View
 
 BLOCKS = "blocks.safetensors"
 """In the folder of the levels: the tree, and the order of the points of the model."""
+TREES: dict[str, type[LodTree]] = {kind.selects: kind for kind in (LodTree, SplatTree)}
+"""What levels are read as, by what lod.json says is selected; blocks, where an older one says nothing."""
 UNFINISHED_PREFIX = "unfinished-"
 """How folders begin in which a component keeps what it has made so far."""
 PHOTOS_AHEAD = 8
@@ -89,6 +92,7 @@ def make_levels(
     files = list(_write(run.lod, tree))
     record = {
         "lod": lod,
+        "selects": tree.selects,
         "steps": made.last_steps,
         "points": [len(level) for level in tree.levels],
         "blocks": len(tree.blocks),
@@ -145,8 +149,12 @@ def has_levels(run: Run, steps: int) -> bool:
 
 
 def _record(run: Run) -> dict[str, Any]:
-    hints = {"files": tuple[str, ...], "steps": int, "points": tuple[int, ...]}
-    return read_keys(run.lod_record, hints, f"delete it, and `{run.to_paste('lod')}` makes the levels again")
+    hints = {"files": tuple[str, ...], "steps": int, "points": tuple[int, ...], "selects": str | None}
+    again = f"delete it, and `{run.to_paste('lod')}` makes the levels again"
+    record = read_keys(run.lod_record, hints, again)
+    if (selects := record["selects"] or LodTree.selects) not in TREES:
+        raise BadInput(f"{run.lod_record}: selects is {selects!r}, not {' or '.join(TREES)}; {again}")
+    return record | {"selects": selects}
 
 
 def load_levels(run: Run, model: SplatModel) -> LodTree:
@@ -162,7 +170,8 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
     again = f"`{run.to_paste('lod')}` makes them"
     if not run.lod_record.exists():
         raise BadInput(f"{run.out}: there are no levels of detail; {again}")
-    points = _record(run)["points"]
+    record = _record(run)
+    points = record["points"]
     try:
         arrays = safetensors.numpy.load_file(run.lod / BLOCKS)
         order = arrays.pop("order")
@@ -173,7 +182,7 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
             raise BadInput(f"{run.lod}: made from {len(order):,} points, and the run has {len(model):,}; {again}")
         first = model.take(torch.from_numpy(order))
         levels = (first, *(SplatModel(model.primitive, params, model.sh_degree, model.near) for params in coarse))
-        tree = LodTree(order, levels, blocks)
+        tree = TREES[record["selects"]](order, levels, blocks)
         wrong = fault(tree, model)
     except (OSError, SafetensorError, KeyError, TypeError, IndexError) as error:
         raise BadInput(f"{run.lod}: damaged ({' '.join(str(error).split())}); {again}") from error
@@ -192,7 +201,7 @@ def measure_levels(
         tree: The levels.
         scene: With held-out views for the quality; without any, training views are drawn for the speed alone.
         rasterizer: What draws.
-        pixels: Largest error of blocks that are selected, pixels.
+        pixels: Largest error of blocks, or largest size of splats, that are selected, pixels.
 
     Returns:
         For metrics.json: "levels", a list from the finest on, and "selected", each with "points" and "bytes" that are

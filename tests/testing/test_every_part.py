@@ -3,7 +3,7 @@
 import pytest
 
 import surfkit.testing
-from surfkit.compress.levels import MergedLevels, PrunedLevels
+from surfkit.compress.levels import Hierarchy, MergedLevels, PrunedLevels
 from surfkit.core.check import BadInput
 from surfkit.core.registry import kebab, kind_of, offered
 from surfkit.depth.patch_match import PatchMatch
@@ -20,6 +20,7 @@ OFFERED = {
 }
 QUICK = {
     "mesher:poisson": Poisson(octree=5, points=5_000),
+    "levels-of-detail:hierarchy": Hierarchy(tile_points=100, steps=3),
     "levels-of-detail:merge": MergedLevels(tile_points=100, steps=3),
     "levels-of-detail:prune": PrunedLevels(tile_points=100, steps=3),
     "executor:slurm": Slurm(cluster="debug"),

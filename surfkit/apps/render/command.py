@@ -10,14 +10,20 @@ from typing import Annotated
 
 import tyro
 
+from surfkit.apps.render.drawn_levels import DrawnLevels
 from surfkit.apps.render.frame_files import Show, draw_frames, identity
 from surfkit.apps.render.path import MAX_FRAMES, MAX_SIDE_PX, CameraPath, flyover, from_file, lens_of, orbit
 from surfkit.apps.render.video import Film, is_video, make_video, require_video
 from surfkit.cli.console_table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
+from surfkit.primitives.drawing import drawn_by
 from surfkit.raster.select import Device
+from surfkit.runs.context import RunContext
+from surfkit.runs.make_levels import load_levels
+from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.pipeline import loaded
+from surfkit.runs.run_method import splats_of
 from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene
@@ -63,6 +69,14 @@ class RenderCommand:
     compressed: bool = False
     """Draw the compressed model of the run (`surfkit compress`)."""
 
+    lod: bool = False
+    """Draw the levels of detail of the run (`surfkit lod`), as each frame needs them; prints how many splats that are,
+    and the time."""
+
+    lod_pixels: float = 1.0
+    """With --lod: largest error of the blocks that are drawn, pixels; for lod:hierarchy largest size of a splat's
+    box."""
+
     keep_frames: bool = False
     """Keep the folder of pictures beside the video, OUT.frames."""
 
@@ -73,6 +87,10 @@ class RenderCommand:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if value is not None and not 0 < value <= 1e6:
                 raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
+        if not 0 <= self.lod_pixels < float("inf"):
+            raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
+        if self.lod and self.compressed:
+            raise BadInput("--lod and --compressed are two models of the run: leave out one of them")
         if self.frames > MAX_FRAMES:
             raise BadInput(f"--seconds {self.seconds:g}: that is {self.frames} frames; at most {MAX_FRAMES} are drawn")
         self.sides()
@@ -111,9 +129,13 @@ class RenderCommand:
             draw = (made.draw_color if self.show == "color" else None) or made.draw
             if draw is None:
                 raise BadInput(f"{ctx.run.out}: what its method has made draws no pictures")
+            levels = self.levels_of(ctx, made) if self.lod else None
+            draw = levels or draw
             flight = self.flight(ctx.scene)
             fps = self.fps or flight.fps or FPS
             model = identity(self.run_folder, self.compressed)
+            if levels is not None:
+                model += f" {self.lod_pixels!r} {identity(ctx.run.lod_record)}"
             if film:
                 make_video(out, Film(flight.cameras, draw, self.show, model, fps), self.keep_frames)
             else:
@@ -127,8 +149,15 @@ class RenderCommand:
                 ("frames", f"{count}, {count / fps:.1f} s at {fps:g} per second"),
                 ("size", f"{lens.width} x {lens.height}"),
                 ("video" if film else "pictures", str(out)),
+                *(levels.rows() if levels is not None else ()),
             ],
         )
+
+    def levels_of(self, ctx: RunContext, made: Reconstruction) -> DrawnLevels:
+        """What draws the levels of detail of the run."""
+        model = splats_of(ctx.run, made)
+        tree = load_levels(ctx.run, model)
+        return DrawnLevels(tree, drawn_by(model.primitive, ctx.rasterizer), self.lod_pixels, self.show != "color")
 
     def flight(self, scene: Scene) -> CameraPath:
         """The cameras of all frames."""

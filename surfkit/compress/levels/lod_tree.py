@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -15,8 +16,33 @@ from surfkit.raster.api import CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
+Tree = TypeVar("Tree", bound="LodTree")
 BLOCK_MARGIN_PX = 3.0
 """Around an image when blocks outside are left out: splats smaller than a pixel are drawn with up to this radius."""
+
+
+def outside(low: np.ndarray, high: np.ndarray, reach: np.ndarray, camera: Camera, near: float) -> np.ndarray:
+    """(B,) bool, boxes of which no splat touches the image of a camera, or only such that are too near.
+
+    Args:
+        low, high: (B, 3) corners of boxes with the centres of all splats.
+        reach: (B,) how far these extend beyond their centres at most.
+        camera: Who looks.
+        near: Nearest depth that is drawn.
+    """
+    pose = camera.world_to_camera.numpy()
+    middle, half = (low + high) / 2, (high - low) / 2
+    local = middle @ pose[:3, :3].T + pose[:3, 3]
+    extent = half @ np.abs(pose[2, :3])
+    found = local[:, 2] + extent <= near
+    sides = (0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)
+    for axis, focal, centre, size in sides:
+        for sign, edge in ((1.0, -BLOCK_MARGIN_PX), (-1.0, size + BLOCK_MARGIN_PX)):
+            normal = np.zeros(3)  # of the plane through the camera centre and that edge, inwards
+            normal[axis], normal[2] = sign, -sign * (edge - centre) / focal
+            normal /= np.linalg.norm(normal)
+            found |= local @ normal + (half @ np.abs(normal @ pose[:3, :3]) + reach) < 0
+    return found
 
 
 @dataclass(frozen=True)
@@ -78,21 +104,8 @@ class LodBlocks:
         return np.where(self.error > 0, found, 0.0)
 
     def outside(self, camera: Camera, near: float) -> np.ndarray:
-        """(B,) bool, blocks of which no splat touches the image of a camera, or only such that are too near."""
-        pose = camera.world_to_camera.numpy()
-        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        local = middle @ pose[:3, :3].T + pose[:3, 3]
-        extent = half @ np.abs(pose[2, :3])
-        found = local[:, 2] + extent <= near
-        sides = (0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)
-        for axis, focal, centre, size in sides:
-            for sign, edge in ((1.0, -BLOCK_MARGIN_PX), (-1.0, size + BLOCK_MARGIN_PX)):
-                normal = np.zeros(3)  # of the plane through the camera centre and that edge, inwards
-                normal[axis], normal[2] = sign, -sign * (edge - centre) / focal
-                normal /= np.linalg.norm(normal)
-                reach = half @ np.abs(normal @ pose[:3, :3]) + self.reach
-                found |= local @ normal + reach < 0
-        return found
+        """(B,) bool, see `outside`."""
+        return outside(self.low, self.high, self.reach, camera, near)
 
     def front(self, camera: Camera, pixels: float, near: float | None = None) -> np.ndarray:
         """(K,) positions of the blocks to draw: each point of the full model has exactly one above it or is in it.
@@ -147,12 +160,20 @@ class LodTree:
         blocks: Rows of them as a tree.
     """
 
+    selects: ClassVar[str] = "blocks"
+    """What is chosen for a camera by `seen`; lod.json has it."""
+
     order: np.ndarray
     levels: tuple[SplatModel, ...]
     blocks: LodBlocks
 
     @classmethod
-    def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> LodTree:
+    def sizes_of(cls, count: int) -> list[int] | None:
+        """Points that the levels of a model of `count` points must have; None where they may have any."""
+        return None
+
+    @classmethod
+    def of(cls: type[Tree], order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> Tree:
         """The tree of a list of blocks, the root first and parents before children.
 
         Boxes are found, and the errors of parents are raised to those of their children. `order`: (N,) of the points of

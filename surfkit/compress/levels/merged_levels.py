@@ -53,7 +53,7 @@ class MergedLevels(LevelsOfDetail):
 
     def refuse_unfit(self, primitive: Primitive) -> None:
         """See `LevelsOfDetail.refuse_unfit`."""
-        refuse_unmergeable(primitive)
+        refuse_unmergeable(primitive, "merge")
 
     def build(self, given: LodInput) -> LodTree:
         """See `LevelsOfDetail.build`."""

@@ -26,8 +26,9 @@ MIN_MERGED_SCALE = 1e-7
 """Smallest scale of what is merged, local units: a row of discs has no width."""
 
 
-def refuse_unmergeable(primitive: Primitive) -> None:
-    """BadInput if the splats of a primitive are not what its columns means, quats, scales and opacities say."""
+def refuse_unmergeable(primitive: Primitive, lod: str) -> None:
+    """BadInput if the splats of a primitive are not what its columns means, quats, scales and opacities say; `lod` is
+    the name of the part that is to merge them."""
     columns = primitive.columns()
     shapes = {"means": ((3,),), "quats": ((4,),), "scales": ((2,), (3,)), "opacities": ((),)}
     lacking = [
@@ -35,7 +36,7 @@ def refuse_unmergeable(primitive: Primitive) -> None:
         for name, allowed in shapes.items()
         if name not in columns or columns[name].shared or tuple(columns[name].shape) not in allowed
     ]
-    complaint = f"lod:merge cannot merge splats of primitive {name_of(primitive)}"
+    complaint = f"lod:{lod} cannot merge splats of primitive {name_of(primitive)}"
     remedy = "choose lod:prune, which only drops some"
     if lacking:
         raise BadInput(

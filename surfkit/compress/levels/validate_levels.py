@@ -21,6 +21,9 @@ def fault(tree: LodTree, model: SplatModel) -> str | None:
 def _wrong_levels(tree: LodTree, model: SplatModel, sizes: np.ndarray) -> str | None:
     if not len(sizes) or sizes[0] != len(model) or not np.array_equal(np.sort(tree.order), np.arange(len(model))):
         return f"its first level has not each of the {len(model):,} points of the model once"
+    wanted = tree.sizes_of(len(model))
+    if wanted is not None and wanted != sizes.tolist():
+        return f"its levels have {', '.join(map(str, sizes))} points, and those of a tree {', '.join(map(str, wanted))}"
     shapes = {name: (value.shape[1:], value.dtype) for name, value in model.params.items()}
     shared = model.primitive.shared()
     for number, level in enumerate(tree.levels):

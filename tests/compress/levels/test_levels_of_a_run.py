@@ -12,6 +12,7 @@ from surfkit import hookimpl
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.compress.levels import LevelsOfDetail, MergedLevels
+from surfkit.compress.levels.splat_tree import SplatTree
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -235,3 +236,45 @@ def test_the_same_levels_again(finished, tmp_path):
     for name in ("blocks", "level1", "level2"):
         path = f"lod/{name}.safetensors"
         assert np.array_equal(*(np.fromfile(out / path, np.uint8) for out in (finished, again))), name
+
+
+def test_a_tree_of_splats_is_read_as_one_and_drawn_along_a_path(copy, capsys, tmp_path):
+    assert main(["lod", str(copy), "lod:hierarchy", "--lod.tile-points", "100", "--lod.steps", "3"]) == 0
+    record = json.loads((copy / "lod" / "lod.json").read_text())
+    assert record["points"] == [300, 256, 128, 64, 32, 16, 8, 4, 2, 1] and record["selects"] == "splats"
+    with loaded(copy, "cpu") as (ctx, made):
+        tree = load_levels(ctx.run, made.splats)
+        camera = ctx.scene.train[0].camera
+    assert isinstance(tree, SplatTree)
+    assert 1 < len(tree.seen(camera, 20.0)) < len(tree.seen(camera, 0.0)) <= 300
+    assert len(tree.seen(camera, 1e9)) < len(tree.seen(camera, 20.0)), "a camera within the scene"
+    for pixels in ("0", "20"):
+        out = tmp_path / pixels
+        words = ["render", str(copy), "--lod", "--lod-pixels", pixels, "--seconds", "0.1", "--out", str(out)]
+        assert main(words) == 0
+        said = capsys.readouterr().out
+        assert "of 300 in a mean frame" in said and "ms, the median" in said and len(list(out.glob("*.png"))) == 3
+    assert main([*words[:-1], str(tmp_path / "0")]) == 2, "other frames are there"
+    assert "frames of another model" in capsys.readouterr().err
+    assert main(["evaluate", str(copy), "--lod", "--lod-pixels", "20", "--lpips-weights", "none"]) == 0
+
+
+def test_levels_of_another_size_are_no_tree(copy, capsys):
+    assert main(["lod", str(copy), "lod:hierarchy", "--lod.tile-points", "100", "--lod.steps", "0"]) == 0
+    lod = copy / "lod"
+    record = json.loads((lod / "lod.json").read_text())
+    (lod / "level4.safetensors").write_bytes((lod / "level5.safetensors").read_bytes())
+    assert main(["evaluate", str(copy), "--lod", "--lpips-weights", "none"]) == 2
+    assert "damaged" in capsys.readouterr().err
+    (lod / "lod.json").write_text(json.dumps(record | {"selects": "trees"}))
+    assert main(["evaluate", str(copy), "--lod", "--lpips-weights", "none"]) == 2
+    assert "selects is 'trees', not blocks or splats" in capsys.readouterr().err
+
+
+def test_wrong_options_of_a_rendering_are_one_line(copy, capsys):
+    for words, text in (
+        (["--lod", "--lod-pixels", "-1"], "--lod-pixels -1: give 0 or more"),
+        (["--lod", "--compressed"], "two models of the run"),
+    ):
+        assert main(["render", str(copy), *words]) == 2
+        assert text in capsys.readouterr().err
