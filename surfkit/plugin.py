@@ -50,6 +50,8 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.filled import Filled
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
@@ -148,6 +150,9 @@ __all__ = [
     "Features",
     "FileAxes",
     "FileWritten",
+    "Fill",
+    "FillInput",
+    "Filled",
     "Filter",
     "Find",
     "Flat3D",

@@ -1,6 +1,7 @@
 """Holes of depth maps against exact planes, and what must not be filled."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.depth import DepthAnythingV2, Filled, MonocularFill, PatchMatch, PlaneFill, PlaneSweep
 from surfkit.depth.base import Estimate
-from surfkit.depth.fill import FillInput
+from surfkit.depth.fill import Fill, FillInput
 from surfkit.depth.fill_monocular import robust_line
 from surfkit.depth.filled import load_estimate, save_estimate
 from surfkit.depth.prepare_depth_maps import made_from
 from surfkit.scene.camera import Camera
+from surfkit.testing import check_depth_estimator, check_fill
 from surfkit.testing.inputs import depth_input
 
 HEIGHT, WIDTH = 90, 120
@@ -197,6 +199,49 @@ def test_an_estimate_survives_the_file(tmp_path):
             assert (one is None and other is None) or torch.equal(one, other)
         assert (found.normal is None) == (again.normal is None)
         assert found.normal is None or (found.normal - again.normal).abs().max() < 0.01
+
+
+def test_contracts(survey, tmp_path):
+    given, truth = survey
+    maps = write_maps(tmp_path, given, truth)
+    for fill in (PlaneFill(), PlaneFill(contrast=0.5), MonocularFill(maps=str(maps), patch=0.5)):
+        check_fill(fill)
+    check_depth_estimator(Filled(stereo=PlaneSweep(longest=72), fill=PlaneFill(contrast=0.2)))
+
+
+def test_a_network_with_weights_of_a_folder_is_asked_once(survey, weights, tmp_path):
+    """Random weights say nothing of the depth, and nothing is filled."""
+    given, _ = survey
+    fill = MonocularFill(network=DepthAnythingV2(weights=str(weights), shortest=56))
+    check_fill(fill)
+    stereo = PlaneSweep(longest=72)
+    found = list(Filled(stereo=stereo, fill=fill).estimate(replace(given, work=tmp_path), [3, 5]))
+    assert [each.at for each in found] == [3, 5] and not any((each.confidence == 0.3).any() for each in found)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (lambda given: torch.full_like(given.inverse, torch.inf), "not 0 or more"),
+        (lambda given: given.inverse[:-1], "not float32 of"),
+        (lambda given: torch.ones_like(given.inverse), "where no depth is trusted"),
+        (lambda given: 2 * given.inverse.max() * (given.inverse.sum() > 0).float().expand(54, 72), "inverse depth of"),
+        (lambda given: torch.rand(54, 72) * (given.inverse.sum() > 0), "not repeatable"),
+    ],
+)
+def test_fills_that_are_wrong(values, said):
+    with pytest.raises(AssertionError, match=said):
+        check_fill(Wrong(values))
+
+
+@dataclass(frozen=True)
+class Wrong(Fill):
+    """Says what it is told to."""
+
+    values: Callable = torch.zeros_like
+
+    def opened(self, given, wanted):
+        return self.values
 
 
 def test_it_is_what_its_parts_are():
