@@ -93,8 +93,8 @@ def of_maps(options: argparse.Namespace, maps: Path, fills: dict[str, Fill]) -> 
                 errors[key].append(np.abs(depth - exact[each.at][core & where]) / scene.frame.scale)
         joined = {key: np.concatenate(parts) for key, parts in errors.items()}
         found[name] = {
-            "holes": round(float(holes / pixels), 4),
-            "filled": round(float(len(joined["filled"]) / pixels), 4),
+            "holes, share of the pixels": round(float(holes / pixels), 4),
+            "filled, share of the pixels": round(float(len(joined["filled"]) / pixels), 4),
         } | {key: errors_of(error) for key, error in joined.items()}
         print(name, json.dumps(found[name]), flush=True)
     return found
@@ -122,8 +122,9 @@ def of_runs(options: argparse.Namespace, maps: Path, folder: Path) -> dict:
         common += ["--steps", str(options.steps), "--seed", "0", "--out", str(out)]
         call("train", "recipe:surface-short", *words, *common)
         call("evaluate", str(out), "--gt", str(options.data / "gt/mesh.ply"), "--tau", str(options.tau), "--draws", "1")
-        found[name] = json.loads((out / "metrics.json").read_text())["geometry"]
-        print(name, json.dumps(found[name])[:300], flush=True)
+        geometry = json.loads((out / "metrics.json").read_text())["geometry"]
+        found[name] = geometry
+        print(name, json.dumps(found[name])[:1500], flush=True)
     return found
 
 

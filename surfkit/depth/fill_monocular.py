@@ -1,4 +1,4 @@
-"""Holes of depth maps filled with monocular depth, aligned patch by patch to trusted stereo, as in MetroGS (CVPR 2026)."""
+"""Holes of depth maps filled with monocular depth, aligned patch by patch to trusted stereo (MetroGS, CVPR 2026)."""
 
 from __future__ import annotations
 
@@ -72,7 +72,9 @@ class MonocularFill(Fill):
         if not self.maps:
             self.network.refuse_missing()
         elif not Path(self.maps).is_dir():
-            raise BadInput(f"fill.maps is {self.maps}, where there is no folder; name one with a depth map a photograph")
+            raise BadInput(
+                f"fill.maps is {self.maps}, which is no folder; name one with a depth map of each photograph"
+            )
 
     def notice(self) -> str | None:
         """See `Fill.notice`."""

@@ -34,8 +34,8 @@ class PlaneFill(Fill):
     """A plane for each hole of one colour, if the trusted pixels at its rim lie on one: roofs, roads, lawns.
 
     A plane in space is linear in inverse depth. It is found by RANSAC and fitted to the pixels that agree, four fifths
-    of the rim at least; a hole whose rim disagrees is halved until its parts agree or are small. A plane goes no farther
-    from its rim than `reach`, and is left out where a tenth of it lies in space that other views see through.
+    of the rim at least; a hole whose rim disagrees is halved until its parts agree or are small. A plane goes no
+    farther from its rim than `reach`, and is left out where a tenth of it lies in space that other views see through.
     """
 
     contrast: float = 0.03
@@ -146,7 +146,7 @@ class PlaneFill(Fill):
 
 
 def colour_regions(photo: np.ndarray, holes: np.ndarray, contrast: float) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) regions of pixels that neighbours of like colour connect, from 1; and of those, connected holes, 0 outside.
+    """(H, W) regions that neighbours of like colour connect, from 1; and connected holes within them, 0 elsewhere.
 
     Args:
         photo: (3, H, W) in [0, 1].
@@ -157,11 +157,8 @@ def colour_regions(photo: np.ndarray, holes: np.ndarray, contrast: float) -> tup
     number = np.arange(holes.size).reshape(holes.shape)
     alike = [
         (number[one][like], number[other][like])
-        for one, other in (
-            ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-            ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-        )
-        for like in [np.abs(smooth[:, *one] - smooth[:, *other]).max(0) <= contrast]
+        for one, other in ((np.s_[..., :-1], np.s_[..., 1:]), (np.s_[..., :-1, :], np.s_[..., 1:, :]))
+        for like in [np.abs(smooth[one] - smooth[other]).max(0) <= contrast]
     ]
     a, b = (np.concatenate(ends) for ends in zip(*alike, strict=True))
     inside = holes.ravel()[a] & holes.ravel()[b]

@@ -224,7 +224,7 @@ class DepthPreparation:
 
 
 def made_from(given: DepthInput, estimator: DepthEstimator) -> str:
-    """A digest of the names and cameras of photographs, the sparse points that they show, and files of the estimator."""
+    """A digest of names and cameras of photographs, sparse points that they show, and files of the estimator."""
     tracks = given.observations
     parts = [digest(tracks.xyz), digest(tracks.error_px), *files_of(estimator, given.views)]
     for view in given.views:

@@ -190,7 +190,8 @@ def test_maps_change_with_the_files(survey, tmp_path):
 def test_an_estimate_survives_the_file(tmp_path):
     draw = torch.Generator().manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(3, 4, 5, generator=draw), dim=0)
-    first = Estimate(2, torch.rand(4, 5, generator=draw), (torch.rand(4, 5, generator=draw) * 255).round() / 255, normal)
+    confidence = (torch.rand(4, 5, generator=draw) * 255).round() / 255
+    first = Estimate(2, torch.rand(4, 5, generator=draw), confidence, normal)
     for found in (first, replace(first, normal=None), Estimate(2, None, None)):
         save_estimate(tmp_path / "a", found)
         again = load_estimate(tmp_path / "a", 2)
@@ -258,7 +259,7 @@ def test_it_is_what_its_parts_are():
         (lambda: Filled(trust=0.5), "below sure"),
         (lambda: PlaneFill(contrast=0.0), "contrast"),
         (lambda: MonocularFill(patch=0.0), "patch"),
-        (lambda: MonocularFill(maps="/nowhere").refuse_missing(), "there is no folder"),
+        (lambda: MonocularFill(maps="/nowhere").refuse_missing(), "which is no folder"),
     ],
 )
 def test_bad_settings_are_one_line(make, said):
