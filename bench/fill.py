@@ -27,16 +27,17 @@ from scipy.ndimage import gaussian_filter
 from stereo import within_core
 
 from surfkit.depth import Filled, MonocularFill, PatchMatch, PlaneFill
-from surfkit.depth.base import DepthInput
+from surfkit.depth.base import DepthInput, Estimate
 from surfkit.depth.fill import Fill
 from surfkit.depth.filled import load_estimate, stereo_path
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_files import write_map, write_record
 from surfkit.io.datasets.read import observations, read
+from surfkit.scene.scene import Scene, View
 from surfkit.testing.synthetic import Box, Flight, Sphere, photograph, write_colmap
 
 STEREO = PatchMatch(passes=3, rounds=1)
 """Of `recipe:surface-short`, at the full size of the photographs, which are small."""
-WORDS = ["--depth.stereo.passes", "3", "--depth.stereo.rounds", "1"]
 WITHIN = (0.25, 0.5, 1.0)
 """Metres by which depth may differ from the exact one."""
 
@@ -46,7 +47,7 @@ def rendered(folder: Path) -> Path:
     write_colmap(folder, photograph(Flight("grid", 25, 160, 120, points=1500, test_every=0)), tracks=True)
     box, ball = Box(), Sphere()
     bounds = trimesh.creation.box(bounds=[box.low, box.high])
-    ground = trimesh.creation.box(bounds=[(-110, -110, -1), (110, 110, 0)])
+    ground = trimesh.creation.box(bounds=[(-12, -12, -1), (12, 12, 0)])
     sphere = trimesh.creation.icosphere(5, ball.radius).apply_translation(ball.centre)
     (folder / "gt").mkdir()
     trimesh.util.concatenate([ground, bounds, sphere]).export(folder / "gt/mesh.ply")
@@ -66,6 +67,7 @@ def of_maps(options: argparse.Namespace, maps: Path, fills: dict[str, Fill]) -> 
     """Shares and errors of the depth maps of some views."""
     data = Data(options.data, scale=options.scale, metres_per_unit=1.0)
     scene = read(data)
+    beside(options.data, maps.parent / "none")
     views, truth = scene.train, Truth(options.data / "gt/mesh.ply", 25.0)
     exact = [truth.seen(view, scene.frame)[0] for view in views]
     (maps / "estimated_depths").mkdir()
@@ -73,13 +75,17 @@ def of_maps(options: argparse.Namespace, maps: Path, fills: dict[str, Fill]) -> 
         path = maps / "estimated_depths" / f"{view.name}.npy"
         np.save(path, simulated(depth, np.random.default_rng(len(view.name))))
     given = DepthInput(views, observations(data, scene), torch.device("cpu"), maps / "work")
-    some, found = range(0, len(views), options.every), {}
+    found = {}
     for name, fill in fills.items():
+        place = beside(options.data, maps.parent / name)
         errors: dict[str, list[np.ndarray]] = {"trusted": [], "filled": [], "guess of stereo there": []}
         pixels, holes = 0, 0
         estimator = Filled(stereo=STEREO, fill=fill)
-        for each in estimator.estimate(given, some):
+        for each in estimator.estimate(given, range(len(views))):
             before = load_estimate(stereo_path(given, each.at), each.at)
+            keep(place, scene, views[each.at], each)
+            if name == "planes":
+                keep(maps.parent / "none", scene, views[each.at], before)
             if each.inverse is None or before.inverse is None:
                 continue
             core = within_core(views[each.at], exact[each.at], scene.frame)
@@ -100,6 +106,22 @@ def of_maps(options: argparse.Namespace, maps: Path, fills: dict[str, Fill]) -> 
     return found
 
 
+def beside(data: Path, folder: Path) -> Path:
+    """A data set with the same photographs, and depth maps of its own."""
+    folder.mkdir()
+    for name in ("images", "sparse"):
+        (folder / name).symlink_to((data / name).resolve())
+    write_record(folder, {"estimator": {"use": "filled"}, "aligned": True})
+    return folder
+
+
+def keep(folder: Path, scene: Scene, view: View, found: Estimate) -> None:
+    """Write the map of a view, in the units of the data set."""
+    if found.inverse is not None and found.confidence is not None:
+        normal = None if found.normal is None else found.normal.numpy()
+        write_map(folder, view.name, (found.inverse * scene.frame.scale).numpy(), found.confidence.numpy(), normal)
+
+
 def errors_of(error: np.ndarray) -> dict:
     """Of some pixels, metres."""
     if not len(error):
@@ -108,19 +130,14 @@ def errors_of(error: np.ndarray) -> dict:
     return shares | {"median m": round(float(np.median(error)), 4)}
 
 
-def of_runs(options: argparse.Namespace, maps: Path, folder: Path) -> dict:
+def of_runs(options: argparse.Namespace, folder: Path) -> dict:
     """F1 of runs."""
-    rows = {
-        "none": ["depth:patch-match", *(word.replace(".stereo", "") for word in WORDS)],
-        "planes": ["depth:filled", "depth.fill:planes", *WORDS],
-        "monocular": ["depth:filled", "depth.fill:monocular", "--depth.fill.maps", str(maps), *WORDS],
-    }
     found = {}
-    for name, words in rows.items():
-        out = folder / name
-        common = ["--data", str(options.data), "--scale", str(options.scale), "--metres-per-unit", "1"]
+    for name in ("none", "planes", "monocular"):
+        out = folder / f"run-{name}"
+        common = ["--data", str(folder / name), "--scale", str(options.scale), "--metres-per-unit", "1"]
         common += ["--steps", str(options.steps), "--seed", "0", "--out", str(out)]
-        call("train", "recipe:surface-short", *words, *common)
+        call("train", "recipe:surface-short", *common)
         call("evaluate", str(out), "--gt", str(options.data / "gt/mesh.ply"), "--tau", str(options.tau), "--draws", "1")
         geometry = json.loads((out / "metrics.json").read_text())["geometry"]
         found[name] = geometry
@@ -138,7 +155,6 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="data set in metres with exact geometry in gt/mesh.ply")
     parser.add_argument("--rendered", action="store_true", help="a made-up scene instead")
     parser.add_argument("--scale", type=float, default=4.0)
-    parser.add_argument("--every", type=int, default=6, help="every Nth photograph is measured")
     parser.add_argument("--steps", type=int, default=400, help="of the runs; 0 makes none")
     parser.add_argument("--tau", type=float, default=0.5, help="metres, of F1")
     parser.add_argument("--name", default="fill", help="of the file in bench/results")
@@ -152,10 +168,10 @@ def main() -> None:
             parser.error("name a data set by --data, or give --rendered")
         maps = folder / "maps"
         maps.mkdir()
-        fills = {"planes": PlaneFill(), "monocular, simulated": MonocularFill(maps=str(maps))}
+        fills = {"planes": PlaneFill(), "monocular": MonocularFill(maps=str(maps))}
         figures = {"data": options.data.name, "scale": options.scale, "maps": of_maps(options, maps, fills)}
         if options.steps:
-            figures |= {"steps": options.steps, "tau m": options.tau, "runs": of_runs(options, maps, folder)}
+            figures |= {"steps": options.steps, "tau m": options.tau, "runs": of_runs(options, folder)}
     print(f"wrote {save(options.name, figures)}")
 
 

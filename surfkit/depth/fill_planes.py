@@ -45,7 +45,7 @@ class PlaneFill(Fill):
     rim: int = 6
     """Width of the rim that a plane is fitted to, pixels of the depth map."""
 
-    tolerance: float = 0.01
+    tolerance: float = 0.005
     """Largest difference between the plane and the inverse depth of a rim pixel, as a share of that."""
 
     reach: float = 2.5
