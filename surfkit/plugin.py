@@ -52,6 +52,8 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.filled import Filled
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.data import Data
@@ -166,6 +168,9 @@ __all__ = [
     "Features",
     "FileAxes",
     "FileWritten",
+    "Fill",
+    "FillInput",
+    "Filled",
     "Filter",
     "Find",
     "Flat3D",

@@ -77,6 +77,10 @@ class DepthEstimator(Component):
         """BadInput if the settings do not fit the photographs; asked before anything is written or deleted."""
         return None
 
+    def files(self, views: Sequence[View]) -> tuple[Path, ...]:
+        """Files that it reads beside the photographs; maps that were made from others are not used again."""
+        return ()
+
     def refuse_missing(self) -> None:
         """BadInput if what it needs is not on this machine; asked before hours of other work."""
         return None

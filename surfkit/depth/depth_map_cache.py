@@ -19,7 +19,7 @@ from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import DISK_FULL, sweep
 from surfkit.core.lock import IN_USE_FILE, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare_depth_maps import DepthPreparation, fault_of, without_damaged
+from surfkit.depth.prepare_depth_maps import DepthPreparation, fault_of, files_of, without_damaged
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, is_whole, map_path, read_record, write_record
 from surfkit.io.datasets.depth_map_index import DepthMapIndex, folder_of, read_made, write_made
 from surfkit.io.datasets.fingerprint import Fingerprint, digest
@@ -47,7 +47,7 @@ def key_of(
     """
     parts = [] if device.type == "cpu" else [device.type]
     parts += [str(dump(estimator)), str(estimator.version), repr(float(scene.frame.scale))]
-    parts += [digest(tracks.xyz), digest(tracks.error_px)]
+    parts += [digest(tracks.xyz), digest(tracks.error_px), *files_of(estimator, scene.train)]
     for view in scene.train:
         known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
         parts += [view.name, known.camera, str(known.size), known.content, str(view.white)]

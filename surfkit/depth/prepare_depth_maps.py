@@ -188,7 +188,7 @@ class DepthPreparation:
             "aligned": self.estimator.aligned,
             "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
             "matched": [view.name for view in views] if self.estimator.matched else None,
-            MADE_FROM_KEY: made_from(given),
+            MADE_FROM_KEY: made_from(given, self.estimator),
         }
 
     def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[EstimatedPhoto]:
@@ -207,7 +207,7 @@ class DepthPreparation:
 
         Its files are named by the position of a photograph, and depend on those that it is compared with.
         """
-        found, path = made_from(given), self.work / MADE_FROM_KEY
+        found, path = made_from(given, self.estimator), self.work / MADE_FROM_KEY
         if not path.exists() or path.read_text() != found:
             shutil.rmtree(self.work, ignore_errors=True)
             with replacing(path) as file:
@@ -223,14 +223,20 @@ class DepthPreparation:
         return float((estimate.confidence > MIN_TRUSTED_CONFIDENCE).float().mean())
 
 
-def made_from(given: DepthInput) -> str:
-    """A digest of the names and cameras of photographs, and of the sparse points that they show."""
+def made_from(given: DepthInput, estimator: DepthEstimator) -> str:
+    """A digest of names and cameras of photographs, sparse points that they show, and files of the estimator."""
     tracks = given.observations
-    parts = [digest(tracks.xyz), digest(tracks.error_px)]
+    parts = [digest(tracks.xyz), digest(tracks.error_px), *files_of(estimator, given.views)]
     for view in given.views:
         seen = tracks.seen.get(view.name)
         parts += [view.name, digest(view.camera), "" if seen is None else digest(seen)]
     return digest("\0".join(parts))
+
+
+def files_of(estimator: DepthEstimator, views: Sequence[View]) -> list[str]:
+    """What tells the files that an estimator reads beside photographs from others: path, size and time of change."""
+    known = [(path, path.stat()) for path in estimator.files(views)]
+    return [f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in known]
 
 
 def are_alike(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:

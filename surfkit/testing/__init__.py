@@ -13,6 +13,7 @@ from surfkit.testing.format_checks import check_format
 from surfkit.testing.image_part_checks import (
     check_appearance,
     check_depth_estimator,
+    check_fill,
     check_loss,
     check_regularizer,
     check_transients,
@@ -45,6 +46,7 @@ __all__ = [
     "check_executor",
     "check_feature_extractor",
     "check_feature_matcher",
+    "check_fill",
     "check_filter",
     "check_format",
     "check_levels_of_detail",

@@ -18,6 +18,7 @@ from torch.nn.functional import interpolate
 from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.fill import Fill, FillInput
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target
 from surfkit.losses.transients import Transients
 from surfkit.primitives.surfel2d import Surfel2D
@@ -239,6 +240,55 @@ def check_depth_estimator(estimator: DepthEstimator) -> None:
     for estimate in found:
         again = resumed[estimate.at]
         assert_same(f"{name}.estimate of a photograph after an interruption", estimate, again, DETERMINISM_HINT)
+
+
+def check_fill(fill: Fill) -> None:
+    """A fill gives finite inverse depths of 0 or more for true maps with a hole in each, of about the true depth where
+    it fills; none where nothing is trusted; the same ones again.
+
+    Args:
+        fill: With settings for photographs of 72 x 54 pixels.
+
+    Raises:
+        BadInput: The fill cannot work on this machine.
+    """
+    name, wanted = type(fill).__name__, [7, 4]
+    fill.refuse_missing()
+    with tempfile.TemporaryDirectory() as place:
+        given, truth = depth_input(Path(place))
+        maps = [_with_hole(given, truth, at) for at in wanted]
+        answers = []
+        for _ in range(2):
+            work = fill.opened(given, wanted)
+            with unchanged(f"{name}.opened", maps=maps):
+                answers.append([work(each) for each in maps])
+        blind = fill.opened(given, wanted)
+        none = [blind(replace(each, inverse=torch.zeros_like(each.inverse), trust=each.trust * 0)) for each in maps]
+    for each, values, again, nothing in zip(maps, *answers, none, strict=True):
+        shape = tuple(each.inverse.shape)
+        right = values.dtype == torch.float32 and tuple(values.shape) == shape
+        assert right, f"{name} gives {values.dtype} of shape {tuple(values.shape)}, not float32 of {shape}"
+        assert torch.isfinite(values).all() and (values >= 0).all(), f"{name}: an inverse depth is not 0 or more"
+        assert_same(f"{name}.opened", values, again, DETERMINISM_HINT)
+        assert not (nothing > 0).any(), f"{name} fills pixels where no depth is trusted that it could be fitted to"
+        depth = truth.exact[given.views[each.at].name].depth.float()
+        filled = each.holes & (values > 0) & (depth > 0)
+        if filled.any():
+            middle = float((values * depth)[filled].median())
+            assert 0.9 < middle < 1.1, f"{name}: what it fills has {middle:.3g} times the inverse depth of the scene"
+
+
+def _with_hole(given: DepthInput, truth: Synthetic, at: int) -> FillInput:
+    """The true map of a view with a hole in the middle, beside those of all other views."""
+    maps = []
+    for view in given.views:
+        depth = truth.exact[view.name].depth
+        maps.append((view.camera, torch.where(depth > 0, 1 / depth, 0).float()))
+    photo = truth.exact[given.views[at].name].color.float()
+    camera, inverse = maps.pop(at)
+    inverse = inverse.clone()
+    inverse[22:32, 30:42] = 0
+    return FillInput(at, photo, camera, inverse, (inverse > 0).float(), maps)
 
 
 def _check_estimate(name: str, estimator: DepthEstimator, estimate: Estimate, camera: Camera) -> None:

@@ -16,6 +16,7 @@ from surfkit.densify.filters import Elongation
 from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import LossGradient
 from surfkit.densify.trim import Trim
+from surfkit.depth.filled import Filled
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
@@ -260,6 +261,7 @@ SURFACE_TABLE = Table(
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
+        Row("+ planes where stereo knows nothing", {"depth": Filled(stereo=surface.SURFACE.depth)}, kept=False),
         Row("stereo alone", {"method": STEREO.method}, kept=False),
     ),
     columns=MESH_COLUMNS,
