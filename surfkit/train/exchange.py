@@ -119,7 +119,7 @@ class Exchange:
         back = self.processes.exchanged(values, self.from_each, self.sent)
         found = values.new_zeros(len(self.splats), values.shape[1])
         if most:
-            return found.index_reduce_(0, self.rows, back, "amax")
+            return found.scatter_reduce_(0, self.rows[:, None].expand_as(back), back, "amax")
         return found.index_add_(0, self.rows, back)
 
 

@@ -29,8 +29,8 @@ class Processes:
 
     def of_each(self, value: int) -> list[int]:
         """The numbers that the processes give, in their order."""
-        found = torch.empty(self.count, dtype=torch.int64)
-        dist.all_gather_into_tensor(found, torch.tensor([value]))
+        found = [torch.empty(1, dtype=torch.int64) for _ in range(self.count)]
+        dist.all_gather(found, torch.tensor([int(value)]))
         return [int(each) for each in found]
 
     def swapped(self, sent: Sequence[int]) -> list[int]:
