@@ -2,7 +2,9 @@
 
 import os
 import tempfile
+from dataclasses import replace
 from datetime import timedelta
+from itertools import islice
 from pathlib import Path
 
 import torch
@@ -15,6 +17,7 @@ from surfkit.scene.camera import Camera
 from surfkit.train.divide import share
 from surfkit.train.exchange import DividedRasterizer
 from surfkit.train.processes import Processes
+from surfkit.train.shards import load_share, save_shares
 
 COLUMNS = ("means", "quats", "scales", "opacities", "sh", "signal", "chosen")
 
@@ -66,6 +69,15 @@ def drawn_together(processes, splats):
     equal = divided.strips(camera())
     found = drawn(divided, splats.take(torch.arange(len(splats))[share(len(splats), processes)]))
     return found, equal, divided.strips(camera())
+
+
+def trained(processes, trainer, path, steps, saved):
+    """Losses and numbers of points of some steps from a checkpoint on, by processes together; the state is saved."""
+    trainer = replace(trainer, rasterizer=DividedRasterizer(NativeRasterizer(), processes))
+    state = load_share(path, processes)
+    done = [(done.losses, done.points) for done in islice(trainer.run(state), steps)]
+    save_shares(saved, state, processes)
+    return done, len(state.points)
 
 
 def in_processes(function, *given, count=2):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import Component, name_of
+from surfkit.core.registry import Component, kebab
 from surfkit.densify.base import Contribution, Policy, Step, Views
 from surfkit.densify.point_cap import PointCap
 from surfkit.primitives.base import Primitive
@@ -51,14 +51,17 @@ def refuse_undivided(setting: str, stage: Stage, primitive: Primitive, rasterize
     parts += [(f"{setting}.prune.{at}", prune) for at, prune in enumerate(stage.prune)]
     for path, part in parts:
         if part is not None and not vars(type(part)).get("divides", False):
-            raise BadInput(f"--processes: {path}:{name_of(part)} does not work with several; choose another, or leave")
+            raise BadInput(
+                f"--processes: {path} {kebab(type(part).__name__)} does not work with several processes; choose another, "
+                "or leave --processes out"
+            )
     if stage.regularizers:
         path = f"{setting}.regularizers.{next(iter(stage.regularizers))}"
         raise BadInput(f"--processes: {path} looks at all points, which no process has; drop it with {path}:none")
     if INTERVAL in primitive.columns():
         raise BadInput("--processes: primitive.smoothing looks at all points, which no process has; set it to 0")
     if primitive.shared() or draws_itself(primitive):
-        raise BadInput(f"--processes: primitive:{name_of(primitive)} is drawn as a whole; choose another")
+        raise BadInput(f"--processes: primitive {kebab(type(primitive).__name__)} is drawn as a whole; choose another")
     if not isinstance(rasterizer, NativeRasterizer):
         raise BadInput("--processes: several processes draw with the compiled kernels of the CPU; add --device cpu")
 
