@@ -162,6 +162,7 @@ def together(work: Work) -> Diverged | None:
                             os.kill(process.pid or 0, signal.SIGTERM)
                 time.sleep(POLL_S)
             listen()
+            codes = [process.exitcode or 0 for process in processes]  # before the others are ended
     finally:
         for process in processes:
             if process.pid is not None and process.exitcode is None:
@@ -173,7 +174,7 @@ def together(work: Work) -> Diverged | None:
         raise KeyboardInterrupt
     if "diverged" in ends:
         return Diverged(*ends["diverged"])
-    refuse_early_end(work, [process.exitcode or 0 for process in processes], ends)
+    refuse_early_end(work, codes, ends)
     return None
 
 
@@ -183,18 +184,18 @@ def refuse_early_end(work: Work, codes: list[int], ends: dict[str, Any]) -> None
         raise BadInput(ends["bad"])
     if "memory" in ends:
         raise out_of_memory(work.at.out, f" in one of {work.count} processes")
-    killed = next((rank for rank, code in enumerate(codes) if code < 0 and code != -signal.SIGKILL), None)
-    killed = next((rank for rank, code in enumerate(codes) if code < 0), None) if killed is None else killed
-    early = [rank for rank, code in enumerate(codes) if code > 0]
-    if not early and killed is None:
+    early = [rank for rank, code in enumerate(codes) if code]
+    if not early:
         return
-    how = f"process {killed} was ended by signal {-codes[killed]}" if killed is not None and not early else None
-    if how is None and "crash" in ends:
-        rank, text = ends["crash"]
+    killed = [rank for rank in early if codes[rank] < 0]
+    if killed:  # the others may have said that they hear nothing of it
+        how = f"process {killed[0]} was ended by signal {-codes[killed[0]]}"
+    else:
+        rank, text = ends.get("crash", (early[0], "it ended early"))
         how = f"process {rank} failed: {text}"
     kept = "the last checkpoint is whole, and the same command goes on from there"
     what = kept if has_checkpoint(work.at.out) else "give the same command again"
-    raise Fault(f"{work.at.out}: {how or f'process {early[0]} ended early'}; all {work.count} have been ended; {what}")
+    raise Fault(f"{work.at.out}: {how}; all {work.count} have been ended; {what}")
 
 
 class Forward:

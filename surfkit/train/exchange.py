@@ -156,15 +156,20 @@ class DividedRender(Render):
         """See `Render.backward`."""
         if rows is not None and rows != len(self._splats):
             raise BadInput("splats that nothing changes are not drawn by several processes together; use --processes 1")
-        here = self._drawn.backward(total, chosen, absolute)
-        parts = [*here.tensors().values(), here.signal, *([] if here.chosen is None else [here.chosen])]
-        flat = [_flat(value) for value in parts]
-        sums = self._exchange.returned(torch.cat(flat, 1)).split([value.shape[1] for value in flat], 1)
-        means, quats, scales, opacities, color, signal, *more = (part.contiguous() for part in sums)
+        means, quats, scales, opacities, color, signal, *more = self._sums(total, chosen, absolute)
         by_sh, touched = torch.zeros_like(self._splats.sh), self._exchange.rows.unique()
         colors_backward(self._splats, self._camera, touched, color[touched], by_sh, means)
         standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=by_sh)
         return Gradients(**standard, signal=signal, chosen=more[0] if more else None)
+
+    def _sums(self, total: Maps, chosen: Maps | None, absolute: bool) -> list[Tensor]:
+        """(N, ...) gradients by what the strips were sent, and the signals; what leads to them is freed."""
+        here = self._drawn.backward(total, chosen, absolute)
+        parts = [*here.tensors().values(), here.signal, *([] if here.chosen is None else [here.chosen])]
+        widths = [math.prod(value.shape[1:]) for value in parts]
+        together = torch.cat([_flat(value) for value in parts], 1)
+        del here, parts
+        return [part.contiguous() for part in self._exchange.returned(together).split(widths, 1)]
 
     def _pixels(self, rank: int) -> slice:
         return pixel_rows(self._strips[rank], self._camera)
