@@ -1,6 +1,6 @@
 """What two processes that train one model together (`surfkit train --processes 2`) save against a single one.
 
-    python bench/divided.py                       # 500,000 surfels, 800 x 600 pixels; some minutes
+    python bench/divided.py                       # 500,000 surfels, 640 x 480 pixels; some minutes
     python bench/divided.py --points 100000 --steps 6 --no-save
 
 Discs of terrain, all of them in view, with harmonics of degree 3, in the steps of recipe:2dgs after step 8,000: all its
@@ -77,7 +77,6 @@ def measure(args: argparse.Namespace, processes: Processes | None) -> dict[str, 
     """What the steps of this process take."""
     if args.points > FEW:  # what a first step loads and keeps is no memory of the model
         measure(argparse.Namespace(points=FEW, size=(64, 64), steps=1), processes)
-    give_back()
     begin, (width, height) = resident_bytes(), args.size
     rows = slice(0, args.points) if processes is None else share(args.points, processes)
     stage, primitive, shown = RECIPES["2dgs"].pretrain, Surfel2D(3), views(width, height)
@@ -135,7 +134,7 @@ def main() -> None:
     """Measure one and two processes in turn, and print and keep medians of the rounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=500_000)
-    parser.add_argument("--size", type=int, nargs=2, default=(800, 600), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--no-save", action="store_true")

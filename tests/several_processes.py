@@ -54,7 +54,7 @@ def cotangents(seed: int) -> Maps:
 def drawn(rasterizer, splats):
     """Maps, what is seen, gradients and contributions of a view."""
     found = {}
-    for times in range(2):  # the second time with strips that cost the same
+    for _ in range(2):  # the second time with strips that cost the same
         render = rasterizer.render(splats, camera(), 0.1)
         gradients = render.backward(cotangents(1), cotangents(2), absolute=True)
         contribution = rasterizer.contribution(splats, camera(), 0.1, 0.5, 0.5)

@@ -209,7 +209,14 @@ class TrainCommand:
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
             maps, points = None if self.no_prepare else self.prepare_cache, PointsOn(self.points_on, self.scratch)
             caches = CacheSettings(self.cache, self.resized_copies, maps, self.gpu_cache, points)
-            metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard, self.processes), intervals, caches)
+            metrics = run(
+                recipe,
+                data,
+                out,
+                Compute(self.device, self.executor, self.tensorboard, self.processes),
+                intervals,
+                caches,
+            )
         show(Run(out, recipe, data), metrics)
         print()
         tell(what_next(Run(out, recipe, data)))

@@ -1,7 +1,7 @@
 """A stage that several processes train together, started and watched by this one (Grendel-GS, Zhao et al. 2025).
 
-Each process has its share of the points and of the optimizer's state, and draws a strip of each picture (`train.divide`,
-`train.exchange`). Checkpoints are those of a single process, so that a run goes on with any number of processes. One
+Each process has its share of the points and of the optimizer's state, and draws a strip of each picture
+(`train.divide`, `train.exchange`). Checkpoints are those of a single process, so that a run goes on with any number of processes. One
 that ends before its time ends all of them, with an error.
 """
 
@@ -33,7 +33,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.runs.folder import Run, RunStage
 from surfkit.runs.photo_light import held_out_response
-from surfkit.runs.run_stage import Intervals, StageJob, begin, drawn_now, pictures_of, return_to_checkpoint, trainer_of
+from surfkit.runs.run_stage import Intervals, StageJob, begin, drawn_now, optimise, return_to_checkpoint, trainer_of
 from surfkit.runs.start import align_priors
 from surfkit.scene.scene import View
 from surfkit.train import checkpoint
@@ -55,7 +55,7 @@ POLL_S = 0.05
 LAST_WORDS_S = 1.0
 """What the others of a process that has ended are given to say why, before they are ended too."""
 SILENCE = timedelta(minutes=30)
-"""After which a process that hears nothing from the others ends; one that is slow, such as to read photographs, lives."""
+"""After which a process that hears nothing from the others ends."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def refuse_processes(run: Run, count: int, rasterizer: Rasterizer, caches: Cache
         raise BadInput(f"--processes {count}: the method of the recipe trains no points; leave it out")
     if recipe.partition is not None:
         raise BadInput(
-            f"--processes {count}: the recipe divides the scene into blocks, which are trained by processes of their own; "
+            f"--processes {count}: the recipe divides the scene into blocks, which are trained by themselves; "
             "choose --executor executor:pool, or partition:none"
         )
     if recipe.refine:
@@ -109,6 +109,8 @@ def optimise_divided(job: StageJob, state: StageState | None, count: int, caches
         Fault: A process ended before its time; the last checkpoint is whole.
         KeyboardInterrupt: The run was asked to stop, and its state is saved.
     """
+    if count == 1:
+        return optimise(job, state)
     at, trainer = job.stage, trainer_of(job)
 
     def fresh() -> StageState:

@@ -180,10 +180,7 @@ class RecipeStages:
             job = StageJob(
                 run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on
             )
-            if self.compute.processes > 1:
-                state = optimise_divided(job, state, self.compute.processes, ctx.caches)
-            else:
-                state = optimise(job, state)
+            state = optimise_divided(job, state, self.compute.processes, ctx.caches)
             del start, given, job  # to free the memory of the photographs
         elif self.is_shared and run.recipe.partition is None:
             state = load_state(run, run.pretrain, ctx.scene)

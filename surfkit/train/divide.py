@@ -20,8 +20,8 @@ from surfkit.core.registry import Component, kebab
 from surfkit.densify.base import Contribution, Policy, Step, Views
 from surfkit.densify.point_cap import PointCap
 from surfkit.primitives.base import Primitive
-from surfkit.primitives.draws import SharedDraws, normals
 from surfkit.primitives.drawing import draws_itself
+from surfkit.primitives.draws import SharedDraws, normals
 from surfkit.primitives.edit import ROW_FIELDS, Edit, merge, sound
 from surfkit.primitives.points import Points
 from surfkit.primitives.smoothing import INTERVAL
@@ -52,8 +52,8 @@ def refuse_undivided(setting: str, stage: Stage, primitive: Primitive, rasterize
     for path, part in parts:
         if part is not None and not vars(type(part)).get("divides", False):
             raise BadInput(
-                f"--processes: {path} {kebab(type(part).__name__)} does not work with several processes; choose another, "
-                "or leave --processes out"
+                f"--processes: {path} {kebab(type(part).__name__)} does not work with several processes; choose "
+                "another, or leave --processes out"
             )
     if stage.regularizers:
         path = f"{setting}.regularizers.{next(iter(stage.regularizers))}"
@@ -124,7 +124,10 @@ def wanted_of_all(processes: Processes, policies: Sequence[Policy], points: Poin
     for policy in policies:
         policy.watch(points, step)
     counts = processes.of_each(len(points))
-    every, whole = EveryPoint({}, {}, {}, own=points, processes=processes, counts=counts), of_all(processes, counts, step)
+    every, whole = (
+        EveryPoint({}, {}, {}, own=points, processes=processes, counts=counts),
+        of_all(processes, counts, step),
+    )
     return merge([sound(policy.edit(every, whole), len(every), policy) for policy in policies])
 
 

@@ -1,4 +1,4 @@
-"""One picture drawn by several processes, each of which has some of the splats (Grendel-GS, Zhao et al. 2025, section 3).
+"""One picture drawn by several processes, each of which has some of the splats (Grendel-GS, Zhao et al. 2025, sec. 3).
 
 "Gaussian-wise" work, which is done by whoever has the splat: raw values, colours, the optimizer. "Pixel-wise" work, by
 whoever has the strip of the picture: projection, blending and its gradients. Between the two, splats go to the strips
@@ -95,27 +95,23 @@ class Exchange:
         rows: (S,) int64, the splats that are sent: those for process 0, then those for process 1, and so on.
     """
 
-    def __init__(
-        self, processes: Processes, splats: Splats, camera: Camera, near: float, strips: list[Strip]
-    ) -> None:
+    def __init__(self, processes: Processes, splats: Splats, camera: Camera, near: float, strips: list[Strip]) -> None:
         self.processes, self.splats, self.camera, self.strips = processes, splats, camera, strips
         each = [may_touch(splats, camera, near, strip).nonzero()[:, 0] for strip in strips]
         self.rows, self.sent = torch.cat(each), [len(rows) for rows in each]
         self.from_each = processes.swapped(self.sent)
 
     def received(self) -> Splats:
-        """(R,) splats that touch the strip of this process, in the order of the processes, with colours for harmonics."""
+        """(R,) splats that touch the strip of this process, in the order of the processes, with colours for sh."""
         parts = [getattr(self.splats, name).detach() for name in STANDARD[:4]]
         columns = [_flat(value).index_select(0, self.rows) for value in parts]
         columns.append(colors(self.splats, self.camera, self.rows))
         found = self.processes.exchanged(torch.cat(columns, 1), self.sent, self.from_each)
         means, quats, scales, opacities, color = found.split([value.shape[1] for value in columns], 1)
-        return replace(
-            self.splats, means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=color
-        )
+        return replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=color)
 
     def returned(self, values: Tensor, most: bool = False) -> Tensor:
-        """(N, C) sums, or the `most`, of what the strips have for each splat of this process, of (R, C) of this strip."""
+        """(N, C) sums, or the `most`, of what strips have for each splat of this process; (R, C) of this strip."""
         back = self.processes.exchanged(values, self.from_each, self.sent)
         found = values.new_zeros(len(self.splats), values.shape[1])
         if most:

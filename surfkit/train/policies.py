@@ -89,7 +89,7 @@ def all_splats(setup: StageSetup, state: StageState) -> Splats:
 
 
 def wanted(setup: StageSetup, state: StageState, step: Step) -> Edit | None:
-    """What the policies ask for together, of what is allowed; of the points of all processes, where there are several."""
+    """What the policies ask for together, of what is allowed; of the points of all processes."""
     policies, points = setup.stage.policies, state.points
     if setup.processes is not None:
         return wanted_of_all(setup.processes, policies, points, step)

@@ -1,4 +1,4 @@
-"""Whole runs by several processes: one that is killed ends them all, another number of them goes on; what is refused."""
+"""Whole runs by several processes: one that is killed ends all, another number of them goes on; what is refused."""
 
 import multiprocessing
 import os
