@@ -1,8 +1,8 @@
 """A stage that several processes train together, started and watched by this one (Grendel-GS, Zhao et al. 2025).
 
 Each process has its share of the points and of the optimizer's state, and draws a strip of each picture
-(`train.divide`, `train.exchange`). Checkpoints are those of a single process, so that a run goes on with any number of processes. One
-that ends before its time ends all of them, with an error.
+(`train.divide`, `train.exchange`). Checkpoints are those of a single process, so that a run goes on with any number of
+processes. One that ends before its time ends all of them, with an error.
 """
 
 from __future__ import annotations

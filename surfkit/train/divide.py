@@ -132,7 +132,7 @@ def wanted_of_all(processes: Processes, policies: Sequence[Policy], points: Poin
 
 
 def of_all(processes: Processes, counts: Sequence[int], step: Step) -> Step:
-    """What policies are told of the points of all processes, from what is known of those of this one; sent when read."""
+    """What policies are told of the points of all processes, from what each knows of its own; sent when read."""
 
     def gathered(values: Tensor) -> Tensor:
         return processes.gathered(values, counts)
