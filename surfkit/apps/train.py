@@ -84,6 +84,11 @@ class TrainCommand:
     """Where the blocks are trained, if the recipe divides the scene into blocks: `executor:pool` trains several at the
     same time on this machine, `executor:ray` and `executor:slurm` use other machines."""
 
+    processes: int = 1
+    """Processes on this machine that train the model together: each has a part of the points and draws a strip of each
+    picture. One needs about 1/processes of the memory for points. For recipes without blocks, on the CPU; the cores are
+    divided among them. Sums are rounded in another order, and so results differ in their last digits."""
+
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints. The last two are kept; an interruption writes one, too."""
 
@@ -155,6 +160,10 @@ class TrainCommand:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         if self.pictures_every is not None and self.pictures_every < 0:
             raise BadInput(f"--pictures-every {self.pictures_every}: give 0 (none) or more steps")
+        if self.processes < 1:
+            raise BadInput(f"--processes {self.processes}: give 1 or more")
+        if self.view and self.processes > 1:
+            raise BadInput(f"--view shows what one process draws; leave it out, or --processes {self.processes}")
         self._refuse_wrong_view()
         if self.recipe.partition is None and (idle := [word for word in ARGV.get() if BLOCKS_ONLY.match(word)]):
             raise BadInput(
@@ -200,7 +209,14 @@ class TrainCommand:
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
             maps, points = None if self.no_prepare else self.prepare_cache, PointsOn(self.points_on, self.scratch)
             caches = CacheSettings(self.cache, self.resized_copies, maps, self.gpu_cache, points)
-            metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
+            metrics = run(
+                recipe,
+                data,
+                out,
+                Compute(self.device, self.executor, self.tensorboard, self.processes),
+                intervals,
+                caches,
+            )
         show(Run(out, recipe, data), metrics)
         print()
         tell(what_next(Run(out, recipe, data)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -29,6 +29,8 @@ instead of 31,000)."""
 @dataclass(frozen=True)
 class ADC(Densify):
     """Clone small and split large points whose screen-space gradient is high; drop faint and huge ones (3DGS)."""
+
+    divides: ClassVar[bool] = True
 
     threshold: float = 2e-4
     """Mean length of the gradient above which a point is densified, in units of half the image size."""

@@ -137,6 +137,11 @@ class Step:
 class Policy(Component):
     """Decides how the set of points changes. It reads the points and a step, and writes only its own statistics."""
 
+    divides: ClassVar[bool] = False
+    """Whether it works where several processes train one model: `watch` treats each point by itself, and `edit`, which
+    is asked in every process about all points, reads the step, `len(points)` and `points.stat(...)` and nothing else. A
+    class says so itself, as another that is derived from it may do otherwise."""
+
     def watch(self, points: Points, step: Step) -> None:  # noqa: B027 (not every policy keeps statistics)
         """Accumulate statistics in `points.stat(...)`. Called after every step."""
 
@@ -215,6 +220,10 @@ def admitted(filters: Sequence[Filter], step: Step, want: Tensor) -> Tensor:
 
 class Signal(Component):
     """Which gradient drives densification."""
+
+    divides: ClassVar[bool] = False
+    """Whether it works where several processes train one model: with `terms` it is given the gradients of all points,
+    without those of one process. A class says so itself."""
 
     absolute: ClassVar[bool] = False
     """Whether the pixels' shares of the chosen gradient are to be summed without their signs."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 
@@ -24,6 +24,8 @@ class PointCap(Densify):
     makes one more urgent than another, only the densifier knows. One with a limit of its own (`Densify.limited`) may
     choose better.
     """
+
+    divides: ClassVar[bool] = True
 
     inner: Annotated[Densify, choice(Densify, without=("limited",))] = ADC()
     """How points are densified."""

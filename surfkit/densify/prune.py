@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -25,6 +25,8 @@ class PruneByImportance(Prune):
 
     Importance is opacity, times how much the pixels show that a point hits, times a power of the volume.
     """
+
+    divides: ClassVar[bool] = True
 
     at: tuple[Steps, ...] = (15_000,)
     """Steps after which to prune; 0 is at once, after the first."""
@@ -79,6 +81,8 @@ def significance(views: Views, splats: Splats, power: float) -> Tensor:
 @dataclass(frozen=True)
 class PruneByOpacity(Prune):
     """Drop faint points every so often, also after densification has ended."""
+
+    divides: ClassVar[bool] = True
 
     below: float = 0.005
     """Opacity that is too little."""

@@ -16,6 +16,8 @@ class LossGradient(Signal):
     """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised to the size of the
     total (CityGaussianV2, eq. gradient)."""
 
+    divides: ClassVar[bool] = True
+
     terms: tuple[str, ...] | None = None
     """Losses, by name, that drive densification; all of them if unset."""
 
@@ -45,6 +47,7 @@ class AbsGradient(Signal):
     clones by the signed gradient at 2e-4: `adc.split_threshold`.
     """
 
+    divides: ClassVar[bool] = True
     absolute: ClassVar[bool] = True
 
     terms: tuple[str, ...] | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -21,6 +21,8 @@ RELEASED_TOP = 5
 @dataclass(frozen=True)
 class Trim(Prune):
     """Drop the points that contribute least to the training views (CityGaussianV2, eq. average contribution)."""
+
+    divides: ClassVar[bool] = True
 
     ratio: float = 0.025
     """Share of the points that each trim drops."""

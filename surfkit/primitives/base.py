@@ -14,6 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import Component, kebab
 from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.columns import SIGMOID, Activation, Column
+from surfkit.primitives.draws import normals
 from surfkit.primitives.points import Columns
 from surfkit.primitives.raw import cloud_of, raw_columns
 from surfkit.raster.api import PRIMITIVE_KINDS, Rasterizer, Render, Splats
@@ -42,6 +43,11 @@ class Primitive(Component):
     has_free_points: ClassVar[bool] = True
     """Whether points can be moved, copied and split; those that are bound to something cannot, and stages that densify
     them are refused."""
+
+    divides: ClassVar[bool] = False
+    """Whether several processes may train it together, each with some of the points: no method looks at other points
+    than those it is given, but for `observed`, and the rasterizer draws it. A class says so itself, as another that is
+    derived from it may do otherwise."""
 
     sh_degree: int = 3
     """Highest degree of the spherical harmonics of a colour, 0 to 3; 0 is one colour for all directions."""
@@ -203,7 +209,7 @@ class Primitive(Component):
         """(times x M, 3) offsets of places drawn from the Gaussians of M points: one of each, then the next of each."""
         splats = self.activate(params, 0)
         scales = torch.nn.functional.pad(splats.scales, (0, 3 - splats.scales.shape[1]))
-        draw = torch.randn(times * len(scales), 3, generator=generator).to(scales)
+        draw = normals(times, len(scales), generator).to(scales)
         return rotated(draw * scales.repeat(times, 1), splats.quats.repeat(times, 1))
 
     def _activation(self, name: str) -> Activation:

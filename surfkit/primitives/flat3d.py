@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,6 +28,8 @@ class Flat3D(Primitive):
     Only two scales are trained. The third follows the smaller of them and has no gradient, so that it always is the
     thinnest axis and gives the normal.
     """
+
+    divides: ClassVar[bool] = True
 
     thickness: float = 1e-3
     """Third scale as a share of the smaller of the other two; 0 makes planes, whose depth at a pixel is that of the

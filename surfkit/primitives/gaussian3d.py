@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -20,6 +20,8 @@ from surfkit.scene.scene import SparsePoints
 @dataclass(frozen=True)
 class Gaussian3D(Smoothable, Primitive):
     """Ellipsoids: sharpest pictures, fuzzy surfaces (3DGS, Kerbl et al. 2023)."""
+
+    divides: ClassVar[bool] = True
 
     antialias: bool = False
     """Dim splats smaller than a pixel by what the dilation adds to them, as the 2D filter of Mip-Splatting does."""

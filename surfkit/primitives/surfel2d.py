@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -18,6 +19,8 @@ from surfkit.scene.scene import SparsePoints
 @dataclass(frozen=True)
 class Surfel2D(Smoothable, Primitive):
     """Flat discs with exact ray intersection: clean surfaces (2DGS, Huang et al. 2024)."""
+
+    divides: ClassVar[bool] = True
 
     def columns(self) -> dict[str, Column]:
         """The standard ones, and the sampling intervals if scales are smoothed."""

@@ -16,6 +16,9 @@ from surfkit.raster.culling import boxes_may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
+WHOLE_IMAGE = (0, 1 << 30)
+"""Rows of tiles, all that there are."""
+
 
 @dataclass(frozen=True)
 class NativeRasterizer(Rasterizer):
@@ -34,21 +37,11 @@ class NativeRasterizer(Rasterizer):
     def render(
         self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
     ) -> Render:
-        return NativeRender(splats, camera, near, MAPS[: 2 + 3 * geometry + (geometry and distortion)])
+        return NativeRender(splats, camera, near, maps_made(geometry, distortion))
 
     def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
         """See `Rasterizer.in_view`."""
-        found = torch.empty(len(splats), dtype=torch.bool)
-        native.kernels().in_view(
-            splats.kind == "surfel",
-            GEOMETRIES.index(splats.geometry),
-            *(t.detach().to("cpu", torch.float32).contiguous() for t in (splats.means, splats.scales)),
-            *_pose_and_lens(camera),
-            near,
-            found,
-            torch.get_num_threads(),
-        )
-        return found.to(splats.means.device)
+        return may_touch(splats, camera, near)
 
     def boxes_in_view(self, boxes: SplatBoxes, camera: Camera, near: float) -> Tensor | None:
         """See `Rasterizer.boxes_in_view`."""
@@ -58,29 +51,56 @@ class NativeRasterizer(Rasterizer):
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
         grey = replace(splats, sh=torch.zeros(len(splats), 1, 3))  # colours cost a third of the projection
-        drawn = _Pass(grey, camera, near)
+        drawn = Pass(grey, camera, near)
         total = torch.zeros(len(splats), dtype=torch.float32)
         count = torch.zeros(len(splats), dtype=torch.int64)
         drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())
         return total, count
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-        drawn = _Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
+        drawn = Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
         opacity = torch.empty(len(points), dtype=torch.float32)
         drawn.native.probe(camera.project(points).contiguous(), opacity, torch.get_num_threads())
         return opacity
 
 
-def _pose_and_lens(camera: Camera) -> tuple[list[float], list[float], int, int]:
+def maps_made(geometry: bool, distortion: bool) -> tuple[str, ...]:
+    """Names of the maps that a view gets."""
+    return MAPS[: 2 + 3 * geometry + (geometry and distortion)]
+
+
+def may_touch(splats: Splats, camera: Camera, near: float, strip: tuple[int, int] = WHOLE_IMAGE) -> Tensor:
+    """(N,) bool, the splats that may touch a pixel of some rows of tiles, and more; see `Rasterizer.in_view`."""
+    found = torch.empty(len(splats), dtype=torch.bool)
+    native.kernels().in_view(
+        splats.kind == "surfel",
+        GEOMETRIES.index(splats.geometry),
+        *(t.detach().to("cpu", torch.float32).contiguous() for t in (splats.means, splats.scales)),
+        *pose_and_lens(camera),
+        near,
+        found,
+        torch.get_num_threads(),
+        *strip,
+    )
+    return found.to(splats.means.device)
+
+
+def pose_and_lens(camera: Camera) -> tuple[list[float], list[float], int, int]:
+    """A camera as the kernels take it: pose, 4 x 4 by rows; fx, fy, cx, cy; width and height."""
     pose = camera.world_to_camera.double().flatten().tolist()
     return pose, [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
 
 
-class _Pass:
-    """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn."""
+class Pass:
+    """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn.
 
-    def __init__(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> None:
-        validate(splats, values=False)
+    Only tiles of the rows of a `strip` are drawn, with the bits of the whole image. `sh` may be (N, 3) colours.
+    """
+
+    def __init__(
+        self, splats: Splats, camera: Camera, near: float, rim: float = 0.5, strip: tuple[int, int] = WHOLE_IMAGE
+    ) -> None:
+        validate(splats if splats.sh.dim() > 2 else replace(splats, sh=splats.sh[:, None]), values=False)
         self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         self.seen = torch.empty(len(splats), dtype=torch.bool)
         self.radii = torch.empty(len(splats), dtype=torch.float32)
@@ -88,7 +108,7 @@ class _Pass:
             splats.kind == "surfel",
             GEOMETRIES.index(splats.geometry),
             self.arrays,
-            *_pose_and_lens(camera),
+            *pose_and_lens(camera),
             near,
             splats.dilation,
             splats.antialias,
@@ -96,6 +116,7 @@ class _Pass:
             self.seen,
             self.radii,
             torch.get_num_threads(),
+            *strip,
         )
         if self.native.first_invalid >= 0:
             validate(splats)
@@ -105,10 +126,22 @@ class _Pass:
 class NativeRender(Render):
     """A view drawn by the native kernels, when its maps are first asked for; keeps what the backward needs."""
 
-    def __init__(self, splats: Splats, camera: Camera, near: float, made: tuple[str, ...]) -> None:
-        self._pass = _Pass(splats, camera, near)
+    def __init__(
+        self,
+        splats: Splats,
+        camera: Camera,
+        near: float,
+        made: tuple[str, ...],
+        strip: tuple[int, int] = WHOLE_IMAGE,
+    ) -> None:
+        self._pass = Pass(splats, camera, near, strip=strip)
         self.seen, self.radii = self._pass.seen, self._pass.radii
         self._size, self._made = (camera.height, camera.width), made
+
+    def pairs_by_row(self) -> list[int]:
+        """Pairs of a splat and a tile in each row of tiles: about what drawing the row costs."""
+        found: list[int] = self._pass.native.pairs_by_row()
+        return found
 
     @cached_property
     def maps(self) -> Maps:  # type: ignore[override]  # drawn when it is asked for

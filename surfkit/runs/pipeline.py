@@ -26,6 +26,7 @@ from surfkit.runs.blocks.train_blocks import Compute, tune_blocks
 from surfkit.runs.command import train_command
 from surfkit.runs.compress_model import decompressed, has_compressed, make_wanted_compressed
 from surfkit.runs.context import RunContext
+from surfkit.runs.divided import optimise_divided, refuse_processes
 from surfkit.runs.ensure_depth_maps import with_maps, with_maps_to_mesh
 from surfkit.runs.folder import (
     Run,
@@ -111,6 +112,7 @@ def run(
         scene = read(run.data)
         meter.scene_read()
         rasterizer, backend = select_rasterizer(compute.device)
+        refuse_processes(run, compute.processes, rasterizer, caches)
         state = load_state(run, run.pretrain, scene, repair=True) if recipe.has_stages else None
         prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
         for mesher in recipe.meshers:
@@ -178,7 +180,7 @@ class RecipeStages:
             job = StageJob(
                 run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on
             )
-            state = optimise(job, state)
+            state = optimise_divided(job, state, self.compute.processes, ctx.caches)
             del start, given, job  # to free the memory of the photographs
         elif self.is_shared and run.recipe.partition is None:
             state = load_state(run, run.pretrain, ctx.scene)

@@ -7,6 +7,7 @@ import surfkit
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.train.adam import Adam, AdamInView
+from surfkit.train.adam_batch import AdamBatch
 
 sys.modules[__name__].__class__ = surfkit.TrainFolder
 
@@ -14,4 +15,4 @@ sys.modules[__name__].__class__ = surfkit.TrainFolder
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Optimizers, by name."""
-    return {"adam": Adam, "adam-in-view": AdamInView}
+    return {"adam": Adam, "adam-in-view": AdamInView, "adam-batch": AdamBatch}

@@ -32,6 +32,8 @@ UPDATED = "updated"
 class Adam(Optimizer):
     """Adam for all points: those out of view move on by momentum, as in 3DGS."""
 
+    divides: ClassVar[bool] = True
+
     moments: Literal["float32", "bfloat16"] = "float32"
     """How the two moments of each parameter are kept. bfloat16 takes a third less memory for parameters and moments;
     the length of a step is then 2.5 % off at random."""

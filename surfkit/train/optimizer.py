@@ -52,6 +52,10 @@ class Optimizer(Component):
     """Whether a step is for the points alone that its view may show. Stages with regularizers, steps with a second
     view, and primitives that draw themselves or have parameters that belong to no point are for all points still."""
 
+    divides: ClassVar[bool] = False
+    """Whether it works where several processes train one model, each with some of the points: a step treats each point
+    by itself, and reads no `splats`. A class says so itself, as another that is derived from it may do otherwise."""
+
     pulls: ClassVar[bool] = False
     """Whether steps want other gradients beside that of the losses (`OptimizerInput.pull`)."""
 

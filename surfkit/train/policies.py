@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import Policy, Step, ViewStatistics
+from surfkit.densify.base import Step, ViewStatistics
 from surfkit.primitives.edit import Edit, merge, sound, withheld
-from surfkit.primitives.points import Points
-from surfkit.raster.api import Splats
+from surfkit.raster.api import Gradients, Splats
 from surfkit.scene.camera import Camera
+from surfkit.train.divide import own_rows, wanted_of_all
 from surfkit.train.in_view import shown_points
 from surfkit.train.setup import StageSetup
 from surfkit.train.state import StageState
@@ -24,9 +24,7 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     """What the policies are told about a step, and nothing about frozen points."""
     stage, index, gradients, in_view = setup.stage, state.index + 1, result.gradients, result.in_view
     camera, points, home = result.target.view.camera, len(state.points), state.points.device
-    combined = stage.signal.combine(
-        gradients.signal if gradients.chosen is None else gradients.chosen, gradients.signal
-    )
+    combined = combined_signal(setup, gradients)
     signed_norm = lengths(gradients.signal).to(home)
     shown = ViewStatistics(
         rows=None if in_view is None else in_view.rows,
@@ -67,6 +65,17 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     )
 
 
+def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:
+    """(N, 2) what drives densification, of the chosen losses and of all."""
+    signal, processes, total = setup.stage.signal, setup.processes, gradients.signal
+    chosen = total if gradients.chosen is None else gradients.chosen
+    if processes is None or signal.terms is None:
+        return signal.combine(chosen, total)
+    rows = own_rows(processes, len(total))
+    chosen, total = processes.gathered(torch.cat([chosen, total], 1)).split(2, 1)
+    return signal.combine(chosen, total)[rows]
+
+
 def rates_at(setup: StageSetup, state: StageState) -> dict[str, float]:
     """The learning rate of each parameter in the coming step."""
     at = state.index + 1, setup.stage.steps
@@ -79,8 +88,11 @@ def all_splats(setup: StageSetup, state: StageState) -> Splats:
     return setup.primitive.activate(state.points.params, 0)
 
 
-def wanted(policies: Sequence[Policy], points: Points, step: Step) -> Edit | None:
-    """What the policies ask for together, of what is allowed."""
+def wanted(setup: StageSetup, state: StageState, step: Step) -> Edit | None:
+    """What the policies ask for together, of what is allowed; of the points of all processes."""
+    policies, points = setup.stage.policies, state.points
+    if setup.processes is not None:
+        return wanted_of_all(setup.processes, policies, points, step)
     for policy in policies:
         policy.watch(points, step)
     edit = merge([sound(policy.edit(points, step), len(points), policy) for policy in policies])

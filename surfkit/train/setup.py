@@ -12,10 +12,13 @@ from surfkit.core.schedule import LearningRate
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.points import Points
 from surfkit.primitives.storage import Storage
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import View
+from surfkit.train.exchange import DividedRasterizer
 from surfkit.train.neighbour_selector import NeighbourSelector
+from surfkit.train.processes import Processes
 from surfkit.train.stage import Stage, rates_of
 from surfkit.train.uploads import TrainingPhotos, Uploads
 
@@ -53,6 +56,15 @@ class StageSetup:
     beside: Callable[[int, Tensor], list[int]] | None = None
     gpu_bytes: int = 0
     home: Storage | None = None
+
+    @property
+    def processes(self) -> Processes | None:
+        """Those that the points are divided over; None where this one has all of them."""
+        return self.rasterizer.processes if isinstance(self.rasterizer, DividedRasterizer) else None
+
+    def count(self, points: Points) -> int:
+        """Points of all processes, of those of this one."""
+        return len(points) if self.processes is None else sum(self.processes.of_each(len(points)))
 
     @cached_property
     def draws(self) -> Rasterizer:

@@ -13,6 +13,7 @@ from surfkit.core.events import PointsEdited, emit
 from surfkit.losses.base import RegularizerInput
 from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.edit import Edit, apply_in_place, fitted, observe
+from surfkit.train.divide import balanced, own_edit, own_rows, shared_draws
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
@@ -69,7 +70,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
-    edit = wanted(stage.policies, state.points, told(setup, state, result)) if stage.policies else None
+    edit = wanted(setup, state, told(setup, state, result)) if stage.policies else None
     grads = pulled(result.shape, result.gradients, result.leaves, list(terms.values()), stage.optimizer.pulls)
     if in_view is not None:
         require_finite_gradients(index, view, grads)
@@ -93,11 +94,17 @@ def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
 
     # Densify: all that the policies ask for is done at once.
     points, state.blocks = state.points.to_rearrange(), None  # which hold the columns
-    apply_in_place(setup.primitive, points, edit, state.generator, order)
-    if len(points) == 0:
+    if setup.processes is None:
+        apply_in_place(setup.primitive, points, edit, state.generator, order)
+    else:  # the edit is for the points of all
+        rows = own_rows(setup.processes, len(points))
+        with shared_draws(edit, rows, state.generator) as draws:
+            apply_in_place(setup.primitive, points, own_edit(edit, rows), draws, order)
+        points = balanced(setup.processes, points)
+    if setup.count(points) == 0:
         raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
     state.points = observe(setup.primitive, points, setup.views, setup.stage.near)
     if edit.max_opacity is not None:
         state.reset_at = index
     if any(counts := edit.counts):
-        emit(PointsEdited(index, *counts, points=len(state.points)))
+        emit(PointsEdited(index, *counts, points=setup.count(state.points)))

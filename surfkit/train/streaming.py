@@ -28,7 +28,13 @@ CHUNK_BYTES = 1 << 24
 """Read at once where rows do not matter."""
 POINT_TENSOR_PREFIXES = ("params.", "first.", "second.", "stats.", "frozen.")
 """What names of tensors that have a row for each point, or for each frozen one, begin with."""
-SAFETENSORS_TYPES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.uint8: "U8"}
+SAFETENSORS_TYPES = {
+    torch.float32: "F32",
+    torch.float64: "F64",
+    torch.bfloat16: "BF16",
+    torch.int64: "I64",
+    torch.uint8: "U8",
+}
 """Types as safetensors names them."""
 
 
@@ -100,25 +106,30 @@ def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
     tensors = small | groups | moments
     with checkpoint.taking_the_place(path) as part:
         with open(part, "wb") as file:
-            starts = _begin(file, tensors, facts, "0" * 64)
+            starts = begin(file, tensors, facts, "0" * 64)
             for name, value in small.items():
                 file.seek(starts[name])
-                file.write(_bytes(value))
+                file.write(bytes_of(value))
             done = 0
             for piece in pieces:
                 for name, value in piece.items():
                     file.seek(starts[f"params.{name}"] + done * math.prod(value.shape[1:]) * value.itemsize)
-                    file.write(_bytes(value))
+                    file.write(bytes_of(value))
                 done += len(piece["means"])
             assert done == len(state.points), "the pieces are not the points"
-        digest = _digest(part, tensors, facts)
-        with open(part, "rb+") as file:
-            _begin(file, tensors, facts, digest)
-            file.flush()
-            os.fsync(file.fileno())
+        finish(part, tensors, facts)
 
 
-def _begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) -> dict[str, int]:
+def finish(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
+    """Give a file whose values are all written its digest, and let the disk know it."""
+    digest = _digest(part, tensors, facts)
+    with open(part, "rb+") as file:
+        begin(file, tensors, facts, digest)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) -> dict[str, int]:
     """Write what comes before the values, as safetensors lays it out; where those of each tensor go, the rest is 0."""
     header: dict[str, Any] = {"__metadata__": {"format": CHECKPOINT_FORMAT, "facts": facts, "digest": digest}}
     ends = 0
@@ -136,7 +147,8 @@ def _begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) 
     return {name: 8 + len(text) + header[name]["data_offsets"][0] for name in tensors}
 
 
-def _bytes(value: Tensor) -> memoryview:
+def bytes_of(value: Tensor) -> memoryview:
+    """What a file has of a tensor (N, ...)."""
     return value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data
 
 

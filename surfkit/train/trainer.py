@@ -98,4 +98,4 @@ class Trainer(StageSetup):
         if edit is not None:
             retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
         state.index, state.whole = index, True
-        return CompletedStep(index, losses, len(state.points), maps, target)
+        return CompletedStep(index, losses, self.count(state.points), maps, target)

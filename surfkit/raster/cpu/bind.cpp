@@ -37,7 +37,7 @@ Planes planes(const std::vector<Optional>& maps) {  // in the order of api.Maps
 
 SplatArrays arrays(const std::vector<Array>& s) {  // in the order of api.Splats.tensors
     return {(int64_t)s.at(0).shape(0),
-            (int)s.at(4).shape(1),
+            s.at(4).ndim() == 2 ? 0 : (int)s.at(4).shape(1),
             s[0].data(),
             s[1].data(),
             s[2].data(),
@@ -91,15 +91,17 @@ void add_raster(nb::module_& m) {
         .def("__init__",
              [](Pass* self, bool surfel, int geometry, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens,
                 int width, int height, double near, double dilation, bool antialias, double rim, Flags seen, Array radii,
-                int threads) {
+                int threads, int first_row, int end_row) {
                  const auto s = arrays(splats);
                  const auto c = camera(pose, lens, width, height, near);
                  nb::gil_scoped_release free;
                  const GaussianForm form{dilation, antialias, (splat::Geometry)geometry};
-                 new (self) Pass(kind_of(surfel, form.geometry), s, c, form, rim, threads, seen.data(), radii.data());
+                 new (self) Pass(kind_of(surfel, form.geometry), s, c, form, rim, threads, seen.data(), radii.data(),
+                                 {first_row, end_row});
              })
         .def_ro("first_invalid", &Pass::first_invalid)
         .def_prop_ro("pairs", &Pass::pairs)
+        .def("pairs_by_row", &Pass::pairs_by_row)
         .def("forward",
              [](Pass& self, int level, std::vector<Optional> maps, int threads) {
                  const Planes p = planes(maps);
@@ -131,11 +133,27 @@ void add_raster(nb::module_& m) {
         });
 
     m.def("in_view", [](bool surfel, int geometry, Array means, Array scales, std::vector<double> pose,
-                        std::vector<double> lens, int width, int height, double near, Flags found, int threads) {
+                        std::vector<double> lens, int width, int height, double near, Flags found, int threads,
+                        int first_row, int end_row) {
         const SplatArrays s{(int64_t)means.shape(0), 0, means.data(), nullptr, scales.data(), nullptr, nullptr};
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
-        in_view(kind_of(surfel, (splat::Geometry)geometry), s, c, threads, found.data());
+        in_view(kind_of(surfel, (splat::Geometry)geometry), s, c, {first_row, end_row}, threads, found.data());
+    });
+    m.def("shade", [](Array means, Array sh, Counts rows, std::vector<double> pose, std::vector<double> lens, int width,
+                      int height, double near, Array rgb, int threads) {
+        const SplatArrays s{(int64_t)means.shape(0), (int)sh.shape(1), means.data(), nullptr, nullptr, nullptr, sh.data()};
+        const auto c = camera(pose, lens, width, height, near);
+        nb::gil_scoped_release free;
+        shade(s, rows.data(), (int64_t)rows.size(), c, threads, rgb.data());
+    });
+    m.def("shade_backward", [](Array means, Array sh, Counts rows, std::vector<double> pose, std::vector<double> lens,
+                               int width, int height, double near, Array by_rgb, Array by_sh, Array by_means,
+                               int threads) {
+        const SplatArrays s{(int64_t)means.shape(0), (int)sh.shape(1), means.data(), nullptr, nullptr, nullptr, sh.data()};
+        const auto c = camera(pose, lens, width, height, near);
+        nb::gil_scoped_release free;
+        shade_backward(s, rows.data(), (int64_t)rows.size(), c, threads, by_rgb.data(), by_sh.data(), by_means.data());
     });
     m.def(
         "kernels",

@@ -56,6 +56,12 @@ int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outl
     return count;
 }
 
+// Keeps those of some tiles that are in a strip; their number.
+int inside(Strip strip, int tiles_x, uint32_t* tiles, int count) {
+    const int64_t first = (int64_t)strip.first * tiles_x, end = (int64_t)strip.end * tiles_x;
+    return (int)(std::remove_if(tiles, tiles + count, [&](uint32_t t) { return t < first || t >= end; }) - tiles);
+}
+
 template <class Record>
 void project_some(const SplatArrays& splats, const int64_t* rows, int64_t count, const CameraModel<double>& camera,
                   const GaussianForm& form, Record* records, Bound<double>* bounds, bool* drawn) {
@@ -84,11 +90,12 @@ void Pass::each_seen(int threads, F f) const {
 }
 
 Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, const GaussianForm& form,
-           double rim, int threads, bool* seen, float* radii)
+           double rim, int threads, bool* seen, float* radii, Strip strip)
     : kind_(kind),
       camera_(camera),
       form_(form),
       rim_(rim),
+      strip_(strip),
       count_(splats.count),
       tiles_x_((camera.width + kTile - 1) / kTile),
       tiles_y_((camera.height + kTile - 1) / kTile) {
@@ -128,7 +135,8 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             for (int64_t k = 0; k < some; k++) {
                 if (!drawn[k]) continue;
                 const Bound<double> b = widened(bounds[k]);
-                const int tiles = kernel.tiles(b, tiles_x_, tiles_y_, rim_, some_tiles.get());
+                const int tiles = inside(strip_, tiles_x_, some_tiles.get(),
+                                         kernel.tiles(b, tiles_x_, tiles_y_, rim_, some_tiles.get()));
                 if (!tiles) continue;
                 touched.insert(touched.end(), some_tiles.get(), some_tiles.get() + tiles);
                 tiles_[at] = (uint32_t)tiles;
@@ -141,7 +149,12 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
                 at++;
             }
             double rgb[kGroup][3];
-            kernel.shade(splats, index_.get() + first, at - first, camera_, rgb);
+            if (splats.coefficients) {
+                kernel.shade(splats, index_.get() + first, at - first, camera_, rgb);
+            } else {
+                for (int64_t r = first; r < at; r++)
+                    for (int q = 0; q < 3; q++) rgb[r - first][q] = splats.sh[3 * index_[r] + q];
+            }
             for (int64_t r = first; r < at; r++) {
                 const double* look = rgb[r - first];
                 const int64_t i = index_[r];
@@ -226,6 +239,12 @@ Saved Pass::saved() {
     return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data(), blocks_.data()};
 }
 
+std::vector<int64_t> Pass::pairs_by_row() const {
+    std::vector<int64_t> found(tiles_y_);
+    for (int y = 0; y < tiles_y_; y++) found[y] = offsets_[(y + 1) * tiles_x_] - offsets_[y * tiles_x_];
+    return found;
+}
+
 void Pass::forward(Level level, const Planes& out, int threads) {
     const size_t pixels = (size_t)camera_.width * camera_.height;
     level_ = level;
@@ -306,7 +325,13 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         }
         SplatGrad<double> gradients[kGroup];
         gradients_of(kind_, splats, rows, hit, camera_, form_, all, width, gradients);
-        k.shade_backward(splats, rows, hit, camera_, all + color_at, width, out.sh, gradients);
+        if (splats.coefficients) {
+            k.shade_backward(splats, rows, hit, camera_, all + color_at, width, out.sh, gradients);
+        } else {
+            for (int64_t h = 0; h < hit; h++)
+                for (int64_t q = 0, i = 3 * rows[h]; q < 3; q++)
+                    out.sh[i + q] = splats.sh[i + q] > 0 ? (float)all[h * width + color_at + q] : 0.0f;
+        }
         for (int64_t h = 0; h < hit; h++) {
             const int64_t i = rows[h];
             const SplatGrad<double>& g = gradients[h];
@@ -330,7 +355,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         zero(out.quats, 4);
         zero(out.scales, columns);
         zero(out.opacities, 1);
-        zero(out.sh, 3 * splats.coefficients);
+        zero(out.sh, 3 * std::max(1, splats.coefficients));
         zero(out.signal, 2);
         zero(out.chosen, 2);
     };
@@ -391,15 +416,62 @@ void Pass::probe(const double* points, int64_t count, float* opacity, int thread
     });
 }
 
-void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, int threads, bool* found) {
+void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, Strip strip, int threads,
+             bool* found) {
     const int columns = scale_columns(kind);
     const Outlook<double> outlook(camera);
+    // What the strip shows alone is an image of its own, but for the slope of the footprints of gaussians, which is held
+    // near the whole image: of these a box tells, larger by the most that the slope can be.
+    CameraModel<double> part = camera;
+    const int top = std::min(strip.first * kTile, camera.height), most = camera.height - top;
+    part.cy -= top;
+    part.height = strip.end >= 1 << 26 ? most : std::min(most, strip.end * kTile - top);
+    const Outlook<double> narrow(part);
+    const double steepest = std::max(camera.cy, camera.height - camera.cy) / camera.fy + 0.15 * camera.height / camera.fy;
+    const double stretch = camera.fy * std::sqrt(splat::kCutoffSquared * (1 + steepest * steepest)) * 1.0001;
+    const double margin = 2 + Outlook<double>::kMargin;
+    const auto outside = [&](double scale, splat::Vec<double> c) {
+        if (kind != kGaussian) return narrow.misses(kind, scale, c);
+        if (outlook.misses(kind, scale, c)) return true;
+        const double half = stretch * scale / c.z + margin, y = camera.fy * c.y / c.z + camera.cy - top;
+        return y + half < 0 || y - half > part.height;
+    };
     parallel(chunks_of(splats.count, kChunk), threads, [&](int64_t c) {
         for (int64_t i = c * kChunk; i < std::min(splats.count, (c + 1) * kChunk); i++) {
             SplatIn<double> in{};
             in.mean = {splats.means[3 * i], splats.means[3 * i + 1], splats.means[3 * i + 2]};
             for (int k = 0; k < columns; k++) in.scale[k] = splats.scales[columns * i + k];
-            found[i] = !outlook.misses(kind, largest_scale(in), splat::mul(camera.turn, in.mean) + camera.shift);
+            found[i] = !outside(largest_scale(in), splat::mul(camera.turn, in.mean) + camera.shift);
+        }
+    });
+}
+
+void shade(const SplatArrays& splats, const int64_t* rows, int64_t count, const splat::CameraModel<double>& camera,
+           int threads, float* rgb) {
+    parallel(chunks_of(count, kChunk), threads, [&](int64_t c) {
+        const int64_t from = c * kChunk, some = std::min(kChunk, count - from);
+        double look[kChunk][3];
+        kernels().shade(splats, rows + from, some, camera, look);
+        for (int64_t k = 0; k < some; k++)
+            for (int q = 0; q < 3; q++) rgb[3 * (from + k) + q] = (float)look[k][q];
+    });
+}
+
+void shade_backward(const SplatArrays& splats, const int64_t* rows, int64_t count,
+                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh,
+                    float* by_means) {
+    parallel(chunks_of(count, kChunk), threads, [&](int64_t c) {
+        const int64_t from = c * kChunk, some = std::min(kChunk, count - from);
+        double given[kChunk][3];
+        std::vector<SplatGrad<double>> gradients(some);  // zeros
+        for (int64_t k = 0; k < some; k++)
+            for (int q = 0; q < 3; q++) given[k][q] = by_rgb[3 * (from + k) + q];
+        kernels().shade_backward(splats, rows + from, some, camera, given[0], 3, by_sh, gradients.data());
+        for (int64_t k = 0; k < some; k++) {
+            float* to = by_means + 3 * rows[from + k];
+            to[0] = (float)(to[0] + gradients[k].mean.x);
+            to[1] = (float)(to[1] + gradients[k].mean.y);
+            to[2] = (float)(to[2] + gradients[k].mean.z);
         }
     });
 }

@@ -15,12 +15,19 @@ struct GradientArrays {
     float *means, *quats, *scales, *opacities, *sh, *signal, *chosen;  // chosen may be null
 };
 
+// Rows of tiles [first, end) of an image, those that one process of several draws.
+struct Strip {
+    int first, end;
+};
+constexpr Strip kWholeImage = {0, 1 << 30};
+
 class Pass {
   public:
     // Projects and bins. `seen` and `radii` are written for every splat. `rim`: 0.5 if pixel centres are to be drawn, 0
-    // if anything between them.
+    // if anything between them. Outside the `strip` nothing is drawn, and its pixels get the bits of the whole image.
+    // Splats of 0 coefficients have colours in the place of `sh`, as `shade` gives them.
     Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, const GaussianForm& form,
-         double rim, int threads, bool* seen, float* radii);
+         double rim, int threads, bool* seen, float* radii, Strip strip = kWholeImage);
 
     void forward(Level level, const Planes& out, int threads);
     // `absolute`: the pixels' shares of the chosen signal are summed without their signs. `out` has `rows` rows: those
@@ -34,6 +41,8 @@ class Pass {
 
     int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
     int64_t pairs() const { return pairs_; }
+    // Pairs of a splat and a tile by rows of tiles, tiles_y numbers: what a row costs, about.
+    std::vector<int64_t> pairs_by_row() const;
 
   private:
     template <class Record>
@@ -48,6 +57,7 @@ class Pass {
     splat::CameraModel<double> camera_;
     GaussianForm form_;
     double rim_;
+    Strip strip_;
     int64_t count_;
     int tiles_x_, tiles_y_;
     // Per projected splat; those of chunk c start at c * kChunk, their numbers are in seen_in_.
@@ -68,7 +78,16 @@ class Pass {
 };
 
 // Which splats may touch a pixel: all that a Pass would draw, and some more. Only means and scales are read.
-void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, int threads, bool* found);
+void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, Strip strip, int threads,
+             bool* found);
+
+// Colours (count, 3) of the splats of some rows, below 0 too. And the other way: from gradients by them, (count, 3), to
+// those by the coefficients of these rows, in the layout of `sh`, and to what is added to those of all means, (N, 3).
+void shade(const SplatArrays& splats, const int64_t* rows, int64_t count, const splat::CameraModel<double>& camera,
+           int threads, float* rgb);
+void shade_backward(const SplatArrays& splats, const int64_t* rows, int64_t count,
+                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh,
+                    float* by_means);
 
 // The compilation in use, and those that this machine can run (best first).
 const Kernels& kernels();

@@ -79,11 +79,13 @@ class Compute:
         device: The device.
         workers: The executor of the blocks, where the recipe has a partition.
         tensorboard: Whether workers in processes of their own write scalars for TensorBoard.
+        processes: How many train the whole scene together (`runs.divided`); 1 is this one alone.
     """
 
     device: Device = "auto"
     workers: Executor = Inline()
     tensorboard: bool = False
+    processes: int = 1
 
 
 class Unfinished(Fault):
