@@ -67,7 +67,7 @@ class DividedRasterizer(Rasterizer):
         return total[:, 0].float(), total[:, 1].long()
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-        """No process has all splats."""
+        """BadInput: no process has all splats that may be before (P, 3) points."""
         raise BadInput("the opacity in front of points is not found by several processes together; use --processes 1")
 
     def strips(self, camera: Camera) -> list[Strip]:
