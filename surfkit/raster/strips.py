@@ -63,7 +63,7 @@ def colors_backward(
 def contribution(
     colored: Splats, camera: Camera, near: float, powers: tuple[float, float], strip: Strip
 ) -> tuple[Tensor, Tensor]:
-    """`Rasterizer.contribution` over the pixels of a strip."""
+    """`Rasterizer.contribution` over the pixels of a strip: sums (N,) and counts (N,) int64."""
     grey = replace(colored, sh=torch.zeros(len(colored), 3))
     total, count = torch.zeros(len(colored)), torch.zeros(len(colored), dtype=torch.int64)
     Pass(grey, camera, near, strip=strip).native.contribution(*powers, total, count, torch.get_num_threads())

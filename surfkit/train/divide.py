@@ -201,11 +201,11 @@ def balanced(processes: Processes, points: Points) -> Points:
 
     everybody, me = range(processes.count), processes.rank
     sent, received = [common(me, to) for to in everybody], [common(rank, me) for rank in everybody]
-    groups = [
+    params, first, second, stats = [
         {name: exchanged_column(processes, value, sent, received) for name, value in sorted(group.items())}
         for group in (points.params, points.exp_avg, points.exp_avg_sq, points.stats)
     ]
-    return Points(*groups, shared=points.shared, storage=points.storage)
+    return Points(params, first, second, stats, points.shared, points.storage)
 
 
 def exchanged_column(processes: Processes, values: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:

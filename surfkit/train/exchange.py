@@ -67,7 +67,7 @@ class DividedRasterizer(Rasterizer):
         return total[:, 0].float(), total[:, 1].long()
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-        """No process has all splats."""
+        """BadInput: no process has all splats that may be before (P, 3) points."""
         raise BadInput("the opacity in front of points is not found by several processes together; use --processes 1")
 
     def strips(self, camera: Camera) -> list[Strip]:
@@ -107,8 +107,13 @@ class Exchange:
         columns = [_flat(value).index_select(0, self.rows) for value in parts]
         columns.append(colors(self.splats, self.camera, self.rows))
         found = self.processes.exchanged(torch.cat(columns, 1), self.sent, self.from_each)
-        means, quats, scales, opacities, color = found.split([value.shape[1] for value in columns], 1)
+        means, quats, scales, opacities, color = torch.split(found, [value.shape[1] for value in columns], 1)
         return replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=color)
+
+    def touched(self) -> Tensor:
+        """(K,) int64, the splats that are sent, once each."""
+        sent = torch.zeros(len(self.splats), dtype=torch.bool).index_fill_(0, self.rows, True)
+        return sent.nonzero()[:, 0]
 
     def returned(self, values: Tensor, most: bool = False) -> Tensor:
         """(N, C) sums, or the `most`, of what strips have for each splat of this process; (R, C) of this strip."""
@@ -142,7 +147,7 @@ class DividedRender(Render):
         mine = torch.cat([plane[:, self._pixels(self._processes.rank)] for plane in planes]).transpose(0, 1)
         heights = [self._pixels(rank).stop - self._pixels(rank).start for rank in range(self._processes.count)]
         whole = self._processes.gathered(mine.contiguous(), heights).transpose(0, 1).contiguous()
-        found = whole.split([len(plane) for plane in planes])
+        found = torch.split(whole, [len(plane) for plane in planes])
         size = self._camera.height, width
         return Maps(**{n: v.view(*drawn[n].shape[:-2], *size) for n, v in zip(drawn, found, strict=True)})
 
@@ -153,7 +158,7 @@ class DividedRender(Render):
         if rows is not None and rows != len(self._splats):
             raise BadInput("splats that nothing changes are not drawn by several processes together; use --processes 1")
         means, quats, scales, opacities, color, signal, *more = self._sums(total, chosen, absolute)
-        by_sh, touched = torch.zeros_like(self._splats.sh), self._exchange.rows.unique()
+        by_sh, touched = torch.zeros_like(self._splats.sh), self._exchange.touched()
         colors_backward(self._splats, self._camera, touched, color[touched], by_sh, means)
         standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=by_sh)
         return Gradients(**standard, signal=signal, chosen=more[0] if more else None)
@@ -165,7 +170,7 @@ class DividedRender(Render):
         widths = [math.prod(value.shape[1:]) for value in parts]
         together = torch.cat([_flat(value) for value in parts], 1)
         del here, parts
-        return [part.contiguous() for part in self._exchange.returned(together).split(widths, 1)]
+        return [part.contiguous() for part in torch.split(self._exchange.returned(together), widths, 1)]
 
     def _pixels(self, rank: int) -> slice:
         return pixel_rows(self._strips[rank], self._camera)

@@ -72,7 +72,7 @@ def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:
     if processes is None or signal.terms is None:
         return signal.combine(chosen, total)
     rows = own_rows(processes, len(total))
-    chosen, total = processes.gathered(torch.cat([chosen, total], 1)).split(2, 1)
+    chosen, total = torch.split(processes.gathered(torch.cat([chosen, total], 1)), 2, 1)
     return signal.combine(chosen, total)[rows]
 
 

@@ -61,7 +61,7 @@ class Processes:
         plain = values.to(torch.uint8) if values.dtype == torch.bool else values
         counts = counts or self.of_each(len(values))
         found = plain.new_empty(sum(counts), *plain.shape[1:])
-        for rank, part in enumerate(found.split(list(counts))):
+        for rank, part in enumerate(torch.split(found, list(counts))):
             if rank == self.rank:
                 part.copy_(plain)
             if part.numel():

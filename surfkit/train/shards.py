@@ -34,13 +34,15 @@ def load_share(path: Path, processes: Processes) -> StageState:
     state, points = found[0].state, found[0].state.points
     if state.frozen:
         raise BadInput(f"{path}: frozen points are not trained by several processes; use --processes 1")
-    rows, groups = share(len(points), processes), {}
+    rows = share(len(points), processes)
+    groups: dict[str, dict[str, Tensor]] = {}
     with checkpoint.reading(found[0].path) as (file, _):
         for group, attribute in TENSOR_GROUPS.items():
             names = sorted(getattr(points, attribute))
             groups[attribute] = {n: file.get_slice(f"{group}.{n}")[rows].clone() for n in names}
+    params, first, second, stats = (groups[name] for name in ("params", "exp_avg", "exp_avg_sq", "stats"))
     alone = processes.rank == 0
-    own = replace(state, points=Points(**groups, shared=points.shared))
+    own = replace(state, points=Points(params, first, second, stats, points.shared))
     return own if alone else replace(own, cpu_seconds=0.0)  # which are added up when it is written
 
 

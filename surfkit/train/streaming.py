@@ -121,7 +121,7 @@ def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
 
 
 def finish(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
-    """Give a file whose values are all written its digest, and let the disk know it."""
+    """Give a file whose values, (N, ...) each, are all written its digest, and let the disk know it."""
     digest = _digest(part, tensors, facts)
     with open(part, "rb+") as file:
         begin(file, tensors, facts, digest)
@@ -130,7 +130,7 @@ def finish(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
 
 
 def begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) -> dict[str, int]:
-    """Write what comes before the values, as safetensors lays it out; where those of each tensor go, the rest is 0."""
+    """Write what comes before the values, (N, ...) each, as in safetensors; where those of each tensor go."""
     header: dict[str, Any] = {"__metadata__": {"format": CHECKPOINT_FORMAT, "facts": facts, "digest": digest}}
     ends = 0
     for name, value in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):  # so that all is aligned
