@@ -4,12 +4,12 @@
     python bench/divided.py --spread 2            # each view shows a quarter of them
     python bench/divided.py --points 100000 --steps 6 --no-save
 
-Discs of terrain, all of them in view unless it is spread, with harmonics of degree 3, in the steps of recipe:2dgs after step 8,000: all its
-losses, Adam, statistics of densification. One thread for each process. Of each step, after two to warm up: seconds by
-the clock, and CPU seconds of the process, with all its threads; medians, of two processes those of the slower one. On a
-machine with other work the CPU seconds tell, as then the clock also counts the waiting. Memory: the highest resident
-memory while the steps are made, above that after the imports and a step with few points; and what the points take as
-tensors.
+Discs of terrain, all of them in view unless it is spread, with harmonics of degree 3, in the steps of recipe:2dgs after
+step 8,000: all its losses, Adam, statistics of densification. One thread for each process. Of each step, after two to
+warm up: seconds by the clock, and CPU seconds of the process, with all its threads; medians, of two processes those of
+the slower one. On a machine with other work the CPU seconds tell, as then the clock also counts the waiting. Memory:
+the highest resident memory while the steps are made, above that after the imports and a step with few points; and what
+the points take as tensors.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def views(width: int, height: int) -> list[View]:
 
 
 def terrain(count: int, width: int, height: int, rows: slice, spread: float) -> dict[str, torch.Tensor]:
-    """Raw parameters of some rows of discs in no order, on hills under the cameras, `spread` times as wide as a view."""
+    """Raw parameters of some rows of discs in no order, on hills, `spread` times as wide as a view."""
     draw = torch.Generator().manual_seed(1)
     xy = spread * (torch.rand(count, 2, generator=draw) - 0.5) * torch.tensor([1.0, height / width])
     z = 0.03 * torch.sin(9 * xy[:, :1]) * torch.cos(7 * xy[:, 1:])
