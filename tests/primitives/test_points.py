@@ -61,7 +61,7 @@ def test_what_a_policy_gives_must_fit_the_points(asked, message):
     asked = Edit(drop=mask(1), clone=torch.ones(6, dtype=torch.int64), move=torch.ones(6, 3))
     assert wanted(setup, state, step).counts == (1, 5, 0)
     asked = None
-    assert wanted([Policy()], points(), step) is None
+    assert wanted(setup, state, step) is None
 
 
 def test_new_rows_start_without_a_past():
