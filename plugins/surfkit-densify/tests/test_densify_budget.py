@@ -60,7 +60,7 @@ def test_the_budget_is_shared_in_proportion_and_kept():
     everything = policy.edit(points, step)
     assert int(everything.clone.sum()) == clones and int(everything.split.sum()) == splits > 20, "no more are named"
     share = (events.index(DUE) + 1) / len(events)
-    budget = 200 + round(((kept + 10 - 200) / (2 * share - share**2)))  # so that there is room for 10
+    budget = 200 + round((kept + 10 - 200) / (2 * share - share**2))  # so that there is room for 10
     edit = Budget(budget=budget).edit(points, step)
     assert points.stat(FIRST_STAT).eq(200).all()
     assert int(edit.clone.sum() + edit.split.sum()) in (9, 10, 11)
