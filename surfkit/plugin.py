@@ -37,6 +37,7 @@ from surfkit.core.schedule import Interval, LearningRate, StepCount, Steps, log_
 from surfkit.core.tree import evolve
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import (
+    ComparedView,
     Contribution,
     Densify,
     Filter,
@@ -98,6 +99,7 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.normals import normals_of
+from surfkit.raster.ssim import ssim_map
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 from surfkit.runs.recipe import Recipe, refuse_unfit_stage
@@ -136,6 +138,7 @@ __all__ = [
     "Column",
     "ColumnType",
     "Columns",
+    "ComparedView",
     "Component",
     "CompletedStep",
     "Compressor",
@@ -308,6 +311,7 @@ __all__ = [
     "rescale",
     "rotated",
     "seeds",
+    "ssim_map",
     "standard_columns",
     "write_json",
 ]

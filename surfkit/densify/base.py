@@ -78,6 +78,23 @@ class ViewStatistics:
             column[self.rows] = torch.maximum(column[self.rows], values)
 
 
+@dataclass(frozen=True)
+class ComparedView:
+    """A step's view as it was drawn, and its photograph.
+
+    Attributes:
+        color: (3, H, W) as drawn, in the light of the photograph.
+        photo: (3, H, W) in [0, 1]; as drawn where the photograph is to be ignored.
+        blended: (H, W) values of pixels to (R,): of each point of `Step.shown`, the sum over the pixels of the value
+            times the weight alpha T that the point is blended with. Pixels to be ignored do not count. It costs a
+            pass forward and one back, of splats in one colour.
+    """
+
+    color: Tensor
+    photo: Tensor
+    blended: Callable[[Tensor], Tensor]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Step:
     """What policies know after one optimisation step; to be read within `watch` and `edit`.
@@ -103,6 +120,8 @@ class Step:
         derived: What was drawn in place of the points, with its `grad_norm`, for a primitive that draws splats made of
             them (`DerivedRender`); None for others.
         in_view: See `shown`; None where the step was for all points.
+        view: The view with its photograph, for policies that look at pixels; only within `watch`, and not of a
+            primitive that draws itself (`Densify.needs_pixels`).
     """
 
     index: int
@@ -120,6 +139,7 @@ class Step:
     signed_norm: Lazy[Tensor | None] = Lazy(None)
     derived: Derived | None = None
     in_view: ViewStatistics | None = None
+    view: Lazy[ComparedView | None] = Lazy(None)
 
     @property
     def shown(self) -> ViewStatistics:
@@ -163,6 +183,11 @@ class Densify(Policy):
     @property
     def needs_absolute(self) -> bool:
         """Whether it only works with a signal of absolute pixel gradients (`Signal.absolute`); others are refused."""
+        return False
+
+    @property
+    def needs_pixels(self) -> bool:
+        """Whether it reads `Step.view`; primitives that draw themselves, which cannot give it, are refused."""
         return False
 
     @property

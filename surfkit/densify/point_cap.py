@@ -71,6 +71,11 @@ class PointCap(Densify):
         return self.inner.needs_absolute
 
     @property
+    def needs_pixels(self) -> bool:
+        """See `Densify.needs_pixels`."""
+        return self.inner.needs_pixels
+
+    @property
     def most_points(self) -> int:
         """See `Densify.most_points`."""
         inner = self.inner.most_points

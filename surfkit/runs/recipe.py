@@ -24,6 +24,7 @@ from surfkit.partition.assign import Assign, SSIMDifference
 from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import RATES
+from surfkit.primitives.drawing import draws_itself
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.runs.methods.base import Method
 from surfkit.runs.methods.splat_optimisation import SplatOptimisation
@@ -248,6 +249,11 @@ def refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
         raise BadInput(
             f"{path}.densify: {name_of(stage.densify)} needs absolute pixel gradients, and signal "
             f"{name_of(stage.signal)} has none; choose {path}.signal:abs-gradient, or another densify"
+        )
+    if stage.densify is not None and stage.densify.needs_pixels and draws_itself(primitive):
+        raise BadInput(
+            f"{path}.densify: {name_of(stage.densify)} needs the weights that points are blended with, and primitive "
+            f"{name_of(primitive)} draws itself without them; choose {path}.densify:adc, or another primitive"
         )
     if stage.appearance is not None:
         stage.appearance.refuse_unfit(primitive)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from surfkit.compress.levels.base import LodInput
-from surfkit.densify.base import Contribution, Step
+from surfkit.densify.base import ComparedView, Contribution, Step
 from surfkit.depth.base import DepthInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import DepthPrior
@@ -86,7 +86,8 @@ def crowd(count: int = 200) -> tuple[Points, Step]:
     params = Surfel2D().init(
         SparsePoints(torch.rand(count, 3, generator=draw), torch.zeros(count, 3, dtype=torch.uint8)), draw
     )
-    contribution = torch.rand(count, generator=draw)
+    contribution, picture = torch.rand(count, generator=draw), torch.Generator().manual_seed(1)
+    color, photo = (torch.rand(3, 12, 16, generator=picture) for _ in range(2))
     step = Step(
         index=1_000,
         steps=30_000,
@@ -100,6 +101,7 @@ def crowd(count: int = 200) -> tuple[Points, Step]:
         rates={"means": 1e-4},
         seed=1,
         signed_norm=4e-4 * torch.rand(count, generator=draw),
+        view=ComparedView(color, photo, lambda values: values.sum() * contribution / count),
     )
     return Points.fresh(params), step
 

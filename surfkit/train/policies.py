@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import Step, ViewStatistics
+from surfkit.densify.base import ComparedView, Step, ViewStatistics
+from surfkit.losses.base import ignoring
 from surfkit.primitives.edit import Edit, merge, sound, withheld
-from surfkit.raster.api import Gradients, Splats
+from surfkit.primitives.init import SH_C0
+from surfkit.raster.api import Gradients, Maps, Splats
 from surfkit.scene.camera import Camera
 from surfkit.train.divide import own_rows, wanted_of_all
 from surfkit.train.in_view import shown_points
@@ -62,7 +65,34 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
         signed_norm=of_all("signed_norm"),
         derived=gradients.derived and gradients.derived.combined(stage.signal.combine),
         in_view=None if in_view is None else shown,
+        view=lambda: compared_view(setup, state, result),
     )
+
+
+def compared_view(setup: StageSetup, state: StageState, result: StepResult) -> ComparedView:
+    """The view of a step with its photograph, and the way from values of its pixels back to the points.
+
+    The sum of e w over the pixels is the gradient of that of e C by the colour of a point. It is taken of grey points:
+    where a colour is held at 0, no gradient would come back.
+    """
+    target, appearance = result.target, result.appearance
+    with torch.no_grad():
+        color = result.maps.need("color")
+        color = color if appearance is None else appearance.shown(color)
+        photo = ignoring(Maps(color=color), target)[1].photo
+
+    def blended(values: Tensor) -> Tensor:
+        if target.mask is not None:
+            values = values * target.mask
+        count, camera, splats = len(result.shape), target.view.camera, result.splats
+        grey = replace(splats, sh=torch.zeros_like(splats.sh[:, :1]))
+        render = setup.rasterizer.render(grey, camera, setup.stage.near, geometry=False, distortion=False)
+        cotangent = torch.zeros_like(color)
+        cotangent[0] = values
+        by_color = render.backward(Maps(color=cotangent), rows=count).sh[:, 0, 0] / SH_C0
+        return by_color.to(state.points.device)
+
+    return ComparedView(color, photo, blended)
 
 
 def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:

@@ -11,7 +11,7 @@ from surfkit.core.codec import dump, load
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component, components, plugins
 from surfkit.densify import ADC, CountCap, PointCap
-from surfkit.densify.base import Densify, Step
+from surfkit.densify.base import ComparedView, Densify, Step
 from surfkit.primitives import Gaussian3D
 from surfkit.primitives.edit import Edit, NewPoints, apply, merge
 from surfkit.primitives.points import Points
@@ -78,7 +78,10 @@ def step_of(points: Points, index: int = 1, **other) -> Step:
     splats = Gaussian3D().activate(points.params, 0)
     per_point = {"seen": torch.ones(len(points), dtype=torch.bool)}
     per_point |= {name: torch.full((len(points),), 1.0) for name in ("grad_norm", "signed_norm")}
-    return step(index, splats=splats, radii=torch.ones(len(points)), **(per_point | other))
+    draw = torch.Generator().manual_seed(1)
+    color, photo = (torch.rand(3, 12, 16, generator=draw) for _ in range(2))
+    view = ComparedView(color, photo, lambda values: torch.full((len(points),), float(values.sum())))
+    return step(index, splats=splats, radii=torch.ones(len(points)), view=view, **(per_point | other))
 
 
 @pytest.mark.parametrize("inner", [Doubling(), Doubling(drops=7), Doubling(clones=3), Doubling(clones=3, drops=20)])

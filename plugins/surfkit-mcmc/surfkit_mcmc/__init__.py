@@ -14,6 +14,7 @@ from surfkit.plugin import (
     MeanScale,
     NormalConsistency,
     Recipe,
+    Row,
     Stage,
     Surfel2D,
     hookimpl,
@@ -46,3 +47,10 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
             mesh=TSDF(),
         ),
     }
+
+
+@hookimpl
+def surfkit_rows() -> Mapping[str, tuple[Row, ...]]:
+    """Its row in the comparison of densifiers."""
+    change = {"pretrain.densify": Relocation(), "pretrain.regularizers": REGULARIZERS}
+    return {"densify": (Row("relocation (3DGS-MCMC)", change, kept=False),)}

@@ -352,6 +352,22 @@ APPEARANCE_TABLE = Table(
     columns=("psnr_aligned", "ssim_aligned"),
 )
 
+ABSOLUTE = RECIPES["absgs"].pretrain
+# Give it --max-points, so that rows differ in where points are, and not in their number. Plugin packages add rows.
+DENSIFY_TABLE = Table(
+    "densify",
+    "What decides where points are added, in 3DGS",
+    RECIPES["3dgs"],
+    (
+        Row("ADC"),
+        Row(
+            "absolute gradient (AbsGS)",
+            {"pretrain.signal": ABSOLUTE.signal, "pretrain.densify": ABSOLUTE.densify},
+            kept=False,
+        ),
+    ),
+)
+
 TABLES = {
     table.name: table
     for table in (
@@ -362,6 +378,7 @@ TABLES = {
         TRIM_TABLE,
         PARTITION_TABLE,
         APPEARANCE_TABLE,
+        DENSIFY_TABLE,
     )
 }
 """The tables that `surfkit ablate table:NAME` accepts."""
