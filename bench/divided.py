@@ -1,14 +1,15 @@
 """What two processes that train one model together (`surfkit train --processes 2`) save against a single one.
 
     python bench/divided.py                       # 500,000 surfels, 640 x 480 pixels; some minutes
+    python bench/divided.py --spread 2            # each view shows a quarter of them
     python bench/divided.py --points 100000 --steps 6 --no-save
 
-Discs of terrain, all of them in view, with harmonics of degree 3, in the steps of recipe:2dgs after step 8,000: all its
-losses, Adam, statistics of densification. One thread for each process. Of each step, after two to warm up: seconds by
-the clock, and CPU seconds of the process, with all its threads; medians, of two processes those of the slower one. On a
-machine with other work the CPU seconds tell, as then the clock also counts the waiting. Memory: the highest resident
-memory while the steps are made, above that after the imports and a step with few points; and what the points take as
-tensors.
+Discs of terrain, all of them in view unless it is spread, with harmonics of degree 3, in the steps of recipe:2dgs after
+step 8,000: all its losses, Adam, statistics of densification. One thread for each process. Of each step, after two to
+warm up: seconds by the clock, and CPU seconds of the process, with all its threads; medians, of two processes those of
+the slower one. On a machine with other work the CPU seconds tell, as then the clock also counts the waiting. Memory:
+the highest resident memory while the steps are made, above that after the imports and a step with few points; and what
+the points take as tensors.
 """
 
 from __future__ import annotations
@@ -56,12 +57,12 @@ def views(width: int, height: int) -> list[View]:
     return found
 
 
-def terrain(count: int, width: int, height: int, rows: slice) -> dict[str, torch.Tensor]:
-    """Raw parameters of some rows of discs in no order, on hills under the cameras."""
+def terrain(count: int, width: int, height: int, rows: slice, spread: float) -> dict[str, torch.Tensor]:
+    """Raw parameters of some rows of discs in no order, on hills, `spread` times as wide as a view."""
     draw = torch.Generator().manual_seed(1)
-    xy = (torch.rand(count, 2, generator=draw) - 0.5) * torch.tensor([1.0, height / width])
+    xy = spread * (torch.rand(count, 2, generator=draw) - 0.5) * torch.tensor([1.0, height / width])
     z = 0.03 * torch.sin(9 * xy[:, :1]) * torch.cos(7 * xy[:, 1:])
-    spacing = (height / width / count) ** 0.5
+    spacing = spread * (height / width / count) ** 0.5
     whole = {
         "means": torch.cat([xy, z], 1),
         "quats": torch.tensor([1.0, 0, 0, 0]) + 0.1 * torch.randn(count, 4, generator=draw),
@@ -76,13 +77,13 @@ def terrain(count: int, width: int, height: int, rows: slice) -> dict[str, torch
 def measure(args: argparse.Namespace, processes: Processes | None) -> dict[str, Any]:
     """What the steps of this process take."""
     if args.points > FEW:  # what a first step loads and keeps is no memory of the model
-        measure(argparse.Namespace(points=FEW, size=(64, 64), steps=1), processes)
+        measure(argparse.Namespace(points=FEW, size=(64, 64), steps=1, spread=1.0), processes)
     begin, (width, height) = resident_bytes(), args.size
     rows = slice(0, args.points) if processes is None else share(args.points, processes)
     stage, primitive, shown = RECIPES["2dgs"].pretrain, Surfel2D(3), views(width, height)
     smooth = torch.rand(3, height // 8, width // 8, generator=torch.Generator().manual_seed(3))
     photo = torch.nn.functional.interpolate(smooth[None] * 255, (height, width), mode="bilinear")[0].to(torch.uint8)
-    points = Points.fresh(terrain(args.points, width, height, rows))
+    points = Points.fresh(terrain(args.points, width, height, rows, args.spread))
     rasterizer = NativeRasterizer() if processes is None else DividedRasterizer(NativeRasterizer(), processes)
     trainer = Trainer(stage, primitive, shown, [photo] * len(shown), rasterizer)
     state = StageState(points, ViewOrder(len(shown)), torch.Generator().manual_seed(4), index=BEGIN + 1, sh_degree=3)
@@ -135,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=500_000)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--spread", type=float, default=1.0, help="of the terrain, in widths of a view")
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--no-save", action="store_true")
@@ -153,8 +155,9 @@ def main() -> None:
     }
     print(ratios)
     if not args.no_save:
-        shape = {"points": args.points, "width": args.size[0], "height": args.size[1], "rounds": args.rounds}
-        print(save("divided", {**shape, "one": one, "two": two, **ratios}))
+        shape = {"points": args.points, "width": args.size[0], "height": args.size[1], "spread": args.spread}
+        name = "divided" if args.spread == 1 else "divided_spread"
+        print(save(name, {**shape, "rounds": args.rounds, "one": one, "two": two, **ratios}))
 
 
 if __name__ == "__main__":

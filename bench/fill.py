@@ -28,7 +28,7 @@ from stereo import within_core
 
 from surfkit.depth import Filled, MonocularFill, PatchMatch, PlaneFill
 from surfkit.depth.base import DepthInput, Estimate
-from surfkit.depth.fill import Fill
+from surfkit.depth.fill_base import Fill
 from surfkit.depth.filled import load_estimate, stereo_path
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import write_map, write_record

@@ -52,7 +52,7 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.depth.filled import Filled
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.io.datasets.base import Reader

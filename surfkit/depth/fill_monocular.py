@@ -17,7 +17,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator, DepthInput
 from surfkit.depth.depth_anything import DepthAnythingV2
-from surfkit.depth.fill import MIN_FITTING_SHARE, Fill, FillInput
+from surfkit.depth.fill_base import MIN_FITTING_SHARE, Fill, FillInput
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_lens import lens_in

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from surfkit.core.check import require_within
 from surfkit.depth.base import DepthInput
-from surfkit.depth.fill import MIN_FITTING_SHARE, Fill, FillInput
+from surfkit.depth.fill_base import MIN_FITTING_SHARE, Fill, FillInput
 
 DRAWS = 64
 """Planes through three pixels of a rim that are tried (RANSAC, Fischler and Bolles 1981)."""

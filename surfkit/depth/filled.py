@@ -17,7 +17,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.registry import choice, name_of
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.depth.fill_planes import PlaneFill
 from surfkit.depth.neighbours import MAX_CANDIDATE_VIEWS, neighbours
 from surfkit.depth.patch_match import PatchMatch

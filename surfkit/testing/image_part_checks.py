@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target
 from surfkit.losses.transients import Transients
 from surfkit.primitives.surfel2d import Surfel2D

@@ -11,7 +11,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.depth import DepthAnythingV2, Filled, MonocularFill, PatchMatch, PlaneFill, PlaneSweep
 from surfkit.depth.base import Estimate
-from surfkit.depth.fill import Fill, FillInput
+from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.depth.fill_monocular import robust_line
 from surfkit.depth.filled import load_estimate, save_estimate
 from surfkit.depth.prepare_depth_maps import made_from

@@ -54,13 +54,14 @@ def test_what_a_policy_gives_must_fit_the_points(asked, message):
         def edit(self, points, step):
             return asked
 
-    step = SimpleNamespace(owns=None)
+    setup = SimpleNamespace(processes=None, stage=SimpleNamespace(policies=[Policy()]))
+    state, step = SimpleNamespace(points=points()), SimpleNamespace(owns=None)
     with pytest.raises(BadInput, match=message):
-        wanted([Policy()], points(), step)
+        wanted(setup, state, step)
     asked = Edit(drop=mask(1), clone=torch.ones(6, dtype=torch.int64), move=torch.ones(6, 3))
-    assert wanted([Policy()], points(), step).counts == (1, 5, 0)
+    assert wanted(setup, state, step).counts == (1, 5, 0)
     asked = None
-    assert wanted([Policy()], points(), step) is None
+    assert wanted(setup, state, step) is None
 
 
 def test_new_rows_start_without_a_past():
