@@ -11,10 +11,12 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 
+from surfkit.core.check import Fault
+from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.scene.camera import Camera
-from surfkit.train.divide import share
+from surfkit.train.divide import balanced, refuse_apart, share
 from surfkit.train.exchange import DividedRasterizer
 from surfkit.train.processes import Processes
 from surfkit.train.shards import load_share, save_shares
@@ -69,6 +71,32 @@ def drawn_together(processes, splats):
     equal = divided.strips(camera())
     found = drawn(divided, splats.take(torch.arange(len(splats))[share(len(splats), processes)]))
     return found, equal, divided.strips(camera())
+
+
+def shrunk(processes, splats):
+    """The picture of the camera at a quarter of its size, after that of the same camera at its size."""
+    divided = DividedRasterizer(NativeRasterizer(), processes)
+    own = splats.take(torch.arange(len(splats))[share(len(splats), processes)])
+    divided.render(own, camera(), 0.1)
+    return divided.render(own, camera().resized(22, 25), 0.1).maps.color
+
+
+def evened(processes, count):
+    """Moments, some in 16 bits, of points that process 0 alone has, after they have moved on."""
+    own = count if processes.rank == 0 else 0
+    params = {"means": torch.arange(3.0 * count).view(count, 3)[:own], "opacities": torch.arange(1.0 * count)[:own]}
+    short = {name: value.bfloat16() for name, value in params.items()}
+    points = balanced(processes, Points(params, short, dict(short), {}))
+    return points.params, points.exp_avg, points.exp_avg_sq
+
+
+def apart(processes, at, skipped):
+    """What is said where processes are at different views."""
+    try:
+        refuse_apart(processes, at[processes.rank], skipped[processes.rank])
+    except Fault as error:
+        return str(error)
+    return ""
 
 
 def trained(processes, trainer, path, steps, saved):

@@ -104,6 +104,8 @@ class EvaluateCommand:
         zones = Zones(self.seen, self.seams)
         if not 0 <= self.lod_pixels < float("inf"):
             raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
+        if self.lod_pixels != 1 and not self.lod:
+            raise BadInput(f"--lod-pixels {self.lod_pixels:g} is for levels of detail; add --lod")
         if self.compressed and (zones != Zones() or self.lod or self.out is not None or not self.target.is_dir()):
             raise BadInput("--compressed is for a run, without --seen, --seams, --lod and --out")
         with collect_notes(), bars():

@@ -144,9 +144,7 @@ def _guarded(words: list[str]) -> int:
     try:
         return _dispatch(words)
     except KeyboardInterrupt:
-        goes_on = "; the same command goes on" if _given(words).goes_on else ""
-        print(f"surfkit: interrupted{goes_on}", file=sys.stderr)
-        return 130
+        return _interrupted(words)
     except SystemExit as stop:  # --help, and rich when nobody reads its output any more
         if isinstance(stop.code, str):
             raise
@@ -155,11 +153,22 @@ def _guarded(words: list[str]) -> int:
             return READER_LEFT
         return stop.code or 0
     except Exception as error:
+        if isinstance(
+            error.__cause__, KeyboardInterrupt
+        ):  # while a class was made, of which Python makes a RuntimeError
+            return _interrupted(words)
         if (found := _error_line(error, words)) is None:
             raise
         text, status = found
         print(printable(f"surfkit: {text}"), file=sys.stderr)
         return status
+
+
+def _interrupted(words: list[str]) -> int:
+    """Say that a command line was interrupted; its exit status."""
+    goes_on = "; the same command goes on" if _given(words).goes_on else ""
+    print(f"surfkit: interrupted{goes_on}", file=sys.stderr)
+    return 130
 
 
 def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:

@@ -12,10 +12,11 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any
@@ -25,6 +26,7 @@ import torch.distributed as dist
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, emit, say
+from surfkit.core.files import DISK_FULL
 from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import is_out_of_memory, peak_memory_bytes
 from surfkit.core.registry import plugins
@@ -149,8 +151,9 @@ def together(work: Work) -> Diverged | None:
 
     try:
         with graceful() as request:
-            for process in processes:
-                process.start()
+            with without_interrupts():
+                for process in processes:
+                    process.start()
             asked = False
             while any(process.exitcode is None for process in processes):
                 listen()
@@ -180,12 +183,24 @@ def together(work: Work) -> Diverged | None:
     return None
 
 
+@contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Within, started processes do not receive Ctrl-C, which a terminal sends to all: this one passes it on."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def refuse_early_end(work: Work, codes: list[int], ends: dict[str, Any]) -> None:
     """BadInput or Fault where a process has not come to its end, from exit codes and what the processes have said."""
     if "bad" in ends:
         raise BadInput(ends["bad"])
     if "memory" in ends:
         raise out_of_memory(work.at.out, f" in one of {work.count} processes")
+    if "disk" in ends:
+        raise OSError(*ends["disk"])  # which a run of one process meets too
     early = [rank for rank, code in enumerate(codes) if code]
     if not early:
         return
@@ -212,8 +227,17 @@ class Forward:
         self.said.put(("event", event))
 
 
+def _end_orphaned() -> None:
+    """End this process when the one that started it is gone: the next run in the folder must have it alone."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "it was started by another"
+    parent.join()
+    os._exit(1)
+
+
 def _process(rank: int, work: Work, said: Any) -> None:
     """The life of one of the processes."""
+    threading.Thread(target=_end_orphaned, daemon=True).start()
     torch.set_num_threads(work.threads)
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
@@ -234,9 +258,13 @@ def _process(rank: int, work: Work, said: Any) -> None:
         said.put(("diverged", (error.index, error.view, str(error).partition(": ")[2])))
     except BadInput as error:
         said.put(("bad", str(error)))
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, OSError) as error:
         if is_out_of_memory(error):
             said.put(("memory", rank))
+        elif isinstance(error, OSError) and error.errno in DISK_FULL:
+            said.put(("disk", (error.errno, error.strerror, error.filename)))
+        elif isinstance(error, Fault):
+            said.put(("crash", (rank, str(error))))
         else:
             said.put(("crash", (rank, f"{type(error).__name__}: {' '.join(str(error).split())[:300]}")))
     except Exception:

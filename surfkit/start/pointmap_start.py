@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -196,15 +195,18 @@ def read_pointmap(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray | Non
             continue
         try:
             stored = np.load(path, allow_pickle=False)
-            parts = dict(stored) if path.suffix == ".npz" else {"points": stored}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            parts = {"points": stored} if isinstance(stored, np.ndarray) else dict(stored)
+        except Exception as error:  # of a damaged file, zipfile and numpy raise whatever comes
             raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
         points, confidence = parts.get("points"), parts.get("confidence")
-        if points is None or points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f":
+        if points is None or points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f" or not points.size:
             what = "no `points`" if points is None else f"{points.dtype} of shape {points.shape}"
             raise BadInput(f"{path}: it has {what}; a pointmap is floats of (height, width, 3)")
-        if confidence is not None and confidence.shape != points.shape[:2]:
-            raise BadInput(f"{path}: confidence has shape {confidence.shape}, and points {points.shape}")
+        if confidence is not None and (confidence.shape != points.shape[:2] or confidence.dtype.kind not in "biuf"):
+            raise BadInput(
+                f"{path}: confidence is {confidence.dtype} of shape {confidence.shape}, and points have shape "
+                f"{points.shape}; it must have a number for each point"
+            )
         return points, confidence
     return None
 

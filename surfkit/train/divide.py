@@ -8,6 +8,7 @@ one has 1.1 times its share after that, points move on to the next process until
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.registry import Component, kebab
 from surfkit.densify.base import Contribution, Policy, Step, Views
 from surfkit.densify.point_cap import PointCap
@@ -157,6 +158,18 @@ def of_all(processes: Processes, counts: Sequence[int], step: Step) -> Step:
     )
 
 
+def refuse_apart(processes: Processes, at: int, skipped: Sequence[int]) -> None:
+    """Fault where processes are about to draw different views, as one could not read a photograph that others can.
+
+    Args:
+        processes: Those that train.
+        at: Position of the view of this step.
+        skipped: Positions of the views that this process has passed over.
+    """
+    if len(set(zip(processes.of_each(at), processes.of_each(len(skipped)), strict=True))) > 1:
+        raise Fault("a photograph can be read by some of the processes and not by others; see that its disk is there")
+
+
 def own_rows(processes: Processes, count: int) -> slice:
     """Which of the points of all processes the `count` of this one are."""
     counts = processes.of_each(count)
@@ -211,5 +224,8 @@ def balanced(processes: Processes, points: Points) -> Points:
 def exchanged_column(processes: Processes, values: Tensor, sent: Sequence[int], received: Sequence[int]) -> Tensor:
     """(R, ...) of (S, ...), see `Processes.exchanged`; also moments in 16 bits, of which gloo knows nothing."""
     if values.dtype == torch.bfloat16:
-        return processes.exchanged(values.view(torch.uint8), sent, received).view(torch.bfloat16)
+        # as a matrix: the bytes of one number a point would be rows of their own
+        rows = values.reshape(len(values), math.prod(values.shape[1:]))
+        found = processes.exchanged(rows.view(torch.uint8), sent, received).view(torch.bfloat16)
+        return found.view(len(found), *values.shape[1:])
     return processes.exchanged(values, sent, received)

@@ -39,8 +39,8 @@ class DividedRasterizer(Rasterizer):
 
     inner: NativeRasterizer
     processes: Processes
-    borders: dict[bytes, list[int]] = field(default_factory=dict)
-    """By the pose of a camera, the cost of each row of tiles."""
+    borders: dict[tuple[int, int, bytes], list[int]] = field(default_factory=dict)
+    """By the size and the pose of a camera, the cost of each row of tiles."""
 
     def title(self) -> str:
         """See `Rasterizer.title`."""
@@ -181,6 +181,6 @@ def _flat(values: Tensor) -> Tensor:
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
-def _key(camera: Camera) -> bytes:
-    """Of a camera, for a table."""
-    return camera.world_to_camera.double().numpy().tobytes()
+def _key(camera: Camera) -> tuple[int, int, bytes]:
+    """Of a camera, for a table; two cameras of a rig, or two sizes of a photograph, may have one pose."""
+    return camera.width, camera.height, camera.world_to_camera.double().numpy().tobytes()

@@ -13,7 +13,7 @@ from surfkit.core.events import PointsEdited, emit
 from surfkit.losses.base import RegularizerInput
 from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.edit import Edit, apply_in_place, fitted, observe
-from surfkit.train.divide import balanced, own_edit, own_rows, shared_draws
+from surfkit.train.divide import balanced, own_edit, own_rows, refuse_apart, shared_draws
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
@@ -32,6 +32,8 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     """Render the next view, compare it with its photograph, and go back to the splats."""
     stage, index = setup.stage, state.index + 1
     at, target = next_target(setup, state)
+    if setup.processes is not None:
+        refuse_apart(setup.processes, at, state.skipped)
     camera, reads = target.view.camera, maps_of_step(setup, index)
 
     # Render: raw parameters become splats, and these the maps that the terms of this step read.

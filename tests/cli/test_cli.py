@@ -227,6 +227,12 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
     monkeypatch.setitem(COMMANDS, "export", replace(COMMANDS["export"], goes_on=True))
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted; the same command goes on\n")
+
+    def while_a_class_is_made():  # as Python 3.11 has it, where modules are loaded
+        raise RuntimeError("Error calling __set_name__ on 'cached_property' instance") from KeyboardInterrupt()
+
+    command(monkeypatch, while_a_class_is_made)
+    assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted; the same command goes on\n")
     command(monkeypatch, lambda: 3)
     assert main(["export"]) == 3
 

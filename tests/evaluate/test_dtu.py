@@ -116,6 +116,10 @@ def test_files_of_the_benchmark(tmp_path):
     assert read_plane(tmp_path / "plane.mat").tolist() == [1, 2, 3, 4]
     np.savez(tmp_path / "cameras.npz", scale_mat_0=np.diag([2.0, 2, 2, 1]))
     assert read_scale(tmp_path / "cameras.npz")[0, 0] == 2
+    whole = (tmp_path / "cameras.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[:100])  # neither OSError nor ValueError
+    with pytest.raises(BadInput, match="no scale_mat_0 can be read"):
+        read_scale(tmp_path / "cut.npz")
     with pytest.raises(BadInput, match="no ObsMask in it"):
         read_observability(tmp_path / "plane.mat")
     (tmp_path / "text.mat").write_text("no matrix at all")

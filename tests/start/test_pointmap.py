@@ -72,5 +72,17 @@ def test_what_cannot_be_used_is_one_line(tmp_path):
     (tmp_path / f"{name}.npy").write_bytes(b"nothing")
     with pytest.raises(BadInput, match="cannot be read"):
         PointmapStart(maps=str(tmp_path)).cloud(known)
+    (tmp_path / f"{name}.npy").unlink()
+    np.savez_compressed(tmp_path / f"{name}.npz", points=np.random.default_rng(0).random((40, 50, 3)))
+    whole = (tmp_path / f"{name}.npz").read_bytes()
+    (tmp_path / f"{name}.npz").write_bytes(whole[:200] + bytes(60) + whole[260:])
+    with pytest.raises(BadInput, match="cannot be read"):
+        PointmapStart(maps=str(tmp_path)).cloud(known)
+    np.savez(tmp_path / f"{name}.npz", points=np.zeros((4, 5, 3)), confidence=np.full((4, 5), "x"))
+    with pytest.raises(BadInput, match="must have a number for each point"):
+        PointmapStart(maps=str(tmp_path)).cloud(known)
+    np.savez(tmp_path / f"{name}.npz", points=np.zeros((0, 5, 3)))
+    with pytest.raises(BadInput, match="a pointmap is floats of"):
+        PointmapStart(maps=str(tmp_path)).cloud(known)
     with pytest.raises(BadInput, match="start.unsure"):
         replace(PointmapStart(), unsure=1.0)

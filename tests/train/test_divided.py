@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from several_processes import crowd, drawn, drawn_together, in_processes, trained
+from several_processes import apart, camera, crowd, drawn, drawn_together, evened, in_processes, shrunk, trained
 
 from surfkit.core.check import BadInput
 from surfkit.densify import ADC, LossGradient, MatchedADC, Trim
@@ -39,6 +39,27 @@ def test_two_processes_draw_the_picture_of_one_and_get_its_gradients(kind, geome
         else:
             assert torch.equal(both, value), name
         assert not name.startswith("map") or torch.equal(other[0][name], value)
+
+
+def test_a_photograph_of_another_size_at_the_same_place_is_drawn_whole():
+    splats = crowd("surfel")
+    wanted = NativeRasterizer().render(splats, camera().resized(22, 25), 0.1).maps.color
+    for found in in_processes(shrunk, splats):
+        assert torch.equal(found, wanted)
+
+
+def test_moments_of_16_bits_move_on_with_their_points():
+    for rank, (params, first, second) in enumerate(in_processes(evened, 8)):
+        assert params["opacities"].tolist() == [4.0 * rank + i for i in range(4)]
+        for name, value in params.items():
+            assert first[name].dtype == torch.bfloat16
+            assert torch.equal(first[name].float(), value) and torch.equal(second[name].float(), value), name
+
+
+@pytest.mark.parametrize("at, skipped, fits", [((3, 3), ([1], [1]), True), ((3, 4), ([], []), False)])
+def test_processes_that_are_at_different_views_end(at, skipped, fits):
+    for found in in_processes(apart, at, skipped):
+        assert found == "" if fits else "by some of the processes and not by others" in found
 
 
 # All that looks at more than one point: the ratio of the mean gradients, the quantile of a trim, the largest of a cap.

@@ -156,9 +156,7 @@ def write_report(out: Path, protocol: Protocol, report: Mapping[str, Any]) -> No
 
 def shown_columns(report: Mapping[str, Any]) -> list[str]:
     """Those of the protocol that a row has a figure of, measured or published."""
-    return [
-        name for name in report["columns"] if any({**r["mean"], **r["published"]}.get(name) for r in report["rows"])
-    ]
+    return [name for name in report["columns"] if any(name in {**r["mean"], **r["published"]} for r in report["rows"])]
 
 
 def head_and_cells(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:

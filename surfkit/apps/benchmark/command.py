@@ -42,7 +42,8 @@ class BenchmarkCommand:
     """Folder of the data, laid out as `--describe` shows."""
 
     recipes: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: those of the protocol)")] = ()
-    """Rows: those of the protocol by name, or any recipe (`surfkit recipes`), trained as it is."""
+    """Rows: those of the protocol by name, or any recipe (`surfkit recipes`) with its own settings; its steps are those
+    of the protocol where that has some, as for shibuya."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
     """Scenes of the benchmark to run."""

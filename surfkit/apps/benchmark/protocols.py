@@ -361,9 +361,11 @@ SHIBUYA = Protocol(
     },
     rules=(
         "Photographs are read at a quarter of their size, 160 px wide; every 8th is held out.",
-        "All recipes that make optimisation steps make 2,000, with their schedules scaled.",
+        "All recipes that make optimisation steps make 2,000, with their schedules scaled; those with blocks make "
+        "these before the blocks, and tune blocks for as large a share of their own steps.",
         "Nothing is aligned, as all poses are exact.",
-        "Nobody has published figures; a CPU gives the same bits every time, so figures show what a change does.",
+        "Nobody has published figures. The same machine and versions give the same figures again on a CPU; others may "
+        "differ in last digits, and so a little in figures.",
     ),
     published_in="",
     steps=2_000,

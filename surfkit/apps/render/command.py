@@ -89,6 +89,8 @@ class RenderCommand:
                 raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
         if not 0 <= self.lod_pixels < float("inf"):
             raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
+        if self.lod_pixels != 1 and not self.lod:
+            raise BadInput(f"--lod-pixels {self.lod_pixels:g} is for levels of detail; add --lod")
         if self.lod and self.compressed:
             raise BadInput("--lod and --compressed are two models of the run: leave out one of them")
         if self.frames > MAX_FRAMES:

@@ -92,7 +92,7 @@ def read_scale(path: Path) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as file:
             matrix = np.asarray(file["scale_mat_0"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except Exception as error:  # of a damaged file, zipfile and numpy raise whatever comes
         raise BadInput(f"{path}: no scale_mat_0 can be read from it; copy the file again") from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.linalg.det(matrix) > 0:
         raise BadInput(f"{path}: scale_mat_0 must be a matrix of 4 x 4 numbers that does not mirror")
@@ -102,11 +102,10 @@ def read_scale(path: Path) -> np.ndarray:
 def _matlab(path: Path, wanted: dict[str, tuple[int, ...] | None]) -> dict[str, np.ndarray]:
     """Arrays of a MATLAB file by name, of given shapes where they have one."""
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         found = {name: np.asarray(array) for name, array in loadmat(path, variable_names=list(wanted)).items()}
-    except (MatReadError, OSError, ValueError, TypeError, NotImplementedError, EOFError) as error:
+    except Exception as error:  # of a damaged file, scipy raises whatever comes
         raise BadInput(f"{path}: cannot be read as a MATLAB file: {' '.join(str(error).split())}") from error
     for name, shape in wanted.items():
         if name not in found or found[name].dtype.kind not in "buif" or shape not in (None, found[name].shape):

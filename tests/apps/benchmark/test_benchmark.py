@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from surfkit.apps.benchmark import protocols
-from surfkit.apps.benchmark.benchmark_results import report_of
+from surfkit.apps.benchmark.benchmark_results import head_and_cells, report_of
 from surfkit.apps.benchmark.data_record import data_hash
 from surfkit.apps.benchmark.protocols import PROTOCOLS
 from surfkit.cli import main
 from surfkit.io.datasets import fingerprint
 from surfkit.io.datasets.read import read
 from surfkit.study import rows
+from surfkit.study.metric_columns import TABLE_COLUMNS
 from surfkit.study.row_comparison import figures
 from tests.apps.benchmark.made_up import city, city_protocol, copy
 
@@ -229,3 +230,10 @@ def test_figures_of_runs_without_test_photographs():
     metrics = {"images": images, "geometry": geometry, "points": 3, "seconds": 1.0, "cpu_seconds": 2.0}
     found = figures(metrics)
     assert "psnr" not in found and (found["accuracy"], found["completeness"], found["chamfer"]) == (1.0, 2.0, 1.5)
+
+
+def test_a_column_of_zeros_is_shown(tiny):
+    """An F1 of 0 is a figure; one that nobody has measured is none."""
+    row = {"scene": "a", "recipe": "2dgs", "runs": [{}], "mean": {"psnr": 20.0, "f1": 0.0}, "sd": {}, "published": {}}
+    head, (cells,) = head_and_cells({"columns": ["psnr", "f1", "ssim"], "rows": [row]})
+    assert head[3:] == [TABLE_COLUMNS[name].head for name in ("psnr", "f1")] and float(cells[-1]) == 0
