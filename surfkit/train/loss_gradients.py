@@ -103,6 +103,20 @@ def regularizer_terms(
     return {name: weight * regularizers[name].in_step(splats, given) for name, weight in weights.items() if weight > 0}
 
 
+def terms_with_maps(
+    regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput
+) -> tuple[dict[str, Tensor], Maps | None]:
+    """What `Regularizer.with_maps` gives in a step, weighted, by key, with its graph to the splats; and the gradient by
+    the maps, None where no term has such a part."""
+    leaves = {name: value.detach().requires_grad_() for name, value in given.maps.present().items()}
+    given, found = replace(given, maps=Maps(**leaves)), {}
+    for name, term in regularizers.items():
+        weight = term.weight_at(given.index, given.steps)
+        if weight > 0 and (value := term.with_maps(splats, given)) is not None:
+            found[name] = weight * value
+    return found, gradient(list(found.values()), leaves, shared=True) if found else None
+
+
 def as_numbers(values: Mapping[str, Tensor]) -> dict[str, float]:
     """Scalars as Python numbers; the host waits for the device once."""
     if not values:

@@ -31,6 +31,7 @@ class StepResult:
         appearance: That of the photograph, with its gradient, if the stage learns any.
         render: What goes back once more, for an optimizer that wants other gradients too (`Optimizer.pulls`); None for
             others, as it holds much of a GPU's memory.
+        terms: Parts of regularizers that have moved the maps already (`Regularizer.with_maps`), weighted.
     """
 
     target: Target
@@ -45,6 +46,7 @@ class StepResult:
     gradients: Gradients
     appearance: ImageAppearance | None
     render: Render | None
+    terms: Columns
 
     @property
     def rows(self) -> Tensor | None:
