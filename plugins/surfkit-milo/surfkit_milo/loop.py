@@ -86,7 +86,8 @@ class MeshInTheLoop(Regularizer):
     """Minimum opacity of Gaussians that get pivots."""
 
     truncation: float = 0.002
-    """Signed distances are cut here, in scene extents, or at the diagonal of the box where that is longer."""
+    """Signed distances are cut here, in scene extents, or at the shortest side of the box where that is longer. Pivots
+    farther behind the depth of all views are inside, at this distance."""
 
     longest: float = 1.0
     """Maximum length of an edge that the surface crosses, as a multiple of the half diagonals of the boxes at its ends,
@@ -169,25 +170,33 @@ class MeshInTheLoop(Regularizer):
         shown = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
         at = torch.where(shown, y.floor() * width + x.floor(), 0.0).long()
         distance = (depth.flatten()[at] - z).view(-1, PIVOTS)
-        cut = (2 * boxes.sizes).clamp_min(self.truncation)[:, None]
+        cut = self.cut(boxes)
         sees = (shown & there.flatten()[at]).view(-1, PIVOTS) & (distance > -cut)
         value = torch.where(sees, distance.minimum(cut), 0.0).to(near)
         given.stat(SUM, PIVOTS).index_add_(0, rows, value)
         given.stat(COUNT, PIVOTS).index_add_(0, rows, sees.to(near))
         near.index_add_(0, rows, (sees[:, 0] & (distance[:, 0].abs() < cut[:, 0])).to(near))
 
+    def cut(self, boxes: Boxes) -> Tensor:
+        """(N, 1) where signed distances at the pivots of boxes are cut."""
+        return 2 * boxes.half.detach().amin(1, keepdim=True).clamp_min(self.truncation / 2)
+
     @torch.no_grad()
     def triangulate(self, splats: Splats, given: RegularizerInput) -> None:
-        """Choose Gaussians, give pivots to those of the chosen that were observed, and note where all pivots are."""
-        chosen, used, count = given.stat(CHOSEN), given.stat(USED), given.stat(COUNT, PIVOTS)
-        spread = splats.extra["spread"]
+        """Choose Gaussians, give pivots to those of the chosen that were on the surface, and note where all pivots
+        are."""
+        chosen, used, near = given.stat(CHOSEN), given.stat(USED), given.stat(NEAR)
+        total, count, spread = given.stat(SUM, PIVOTS), given.stat(COUNT, PIVOTS), splats.extra["spread"]
         chosen.copy_(torch.where(spread > 0, spread, chosen))
         self.choose(given)
-        observed = (chosen > 0) & (count.amin(1) > 0)
-        used.copy_(torch.where((spread > 0) | observed, chosen, 0.0))
-        given.stat(PLACES, PIVOTS, 3).copy_(Boxes.of(splats, chosen).places())
+        used.copy_(torch.where((spread > 0) | (count[:, 0] > 0) & (near > 0), chosen, 0.0))
+        boxes = Boxes.of(splats, used)
+        given.stat(PLACES, PIVOTS, 3).copy_(boxes.places())
+        hidden = (used > 0)[:, None] & (count == 0)
+        total.copy_(torch.where(hidden, -self.cut(boxes).to(total), total))
+        count[hidden] = 1.0
         given.stat(DUE).fill_(given.index)
-        for column in (given.stat(SUM, PIVOTS), count, given.stat(NEAR)):
+        for column in (total, count, near):
             column.mul_(0.5)
         _TETRAHEDRA.pop(used, None)
 
