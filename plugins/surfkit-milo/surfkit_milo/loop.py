@@ -1,4 +1,4 @@
-"""The mesh in the loop (MILo, Guédon et al. 2025): extracted from the Gaussians in a step, drawn, and compared with them.
+"""The mesh in the loop (MILo, Guédon et al. 2025): made from the Gaussians in a step, drawn, and compared with them.
 
 1. Some steps before, depth maps of the Gaussians, those of the views of the steps, are fused at the pivots.
 2. Every so many steps, pivots are triangulated (Delaunay); in between, their positions follow the Gaussians.
@@ -42,6 +42,8 @@ CHOSEN, USED, PLACES, DUE = "milo/chosen", "milo/used", "milo/places", "milo/due
 triangulated; where their pivots were then; and the step in which `HandOut` is to give them values."""
 SLOPE = 2.0
 """Occupancy is sigmoid(-2 v) of a value v: at the surface its slope is that of (1 - v) / 2."""
+BEHIND = 1e-3
+"""Weight of a view in which a pivot is farther behind the surface than distances reach: one that sees more decides."""
 SOLID = 0.5
 """Pixels with less alpha show no surface."""
 
@@ -87,7 +89,8 @@ class MeshInTheLoop(Regularizer):
 
     truncation: float = 0.002
     """Signed distances are cut here, in scene extents, or at the shortest side of the box where that is longer. Pivots
-    farther behind the depth of all views are inside, at this distance."""
+    farther behind the depth of all views are inside, at this distance; those outside all views are unknown, and their
+    Gaussians get no pivots."""
 
     longest: float = 1.0
     """Maximum length of an edge that the surface crosses, as a multiple of the half diagonals of the boxes at its ends,
@@ -102,7 +105,7 @@ class MeshInTheLoop(Regularizer):
         require_within({"limit": (1, 2**24), "faint": (0, 1), "truncation": (1e-9, 1e6)}, self)
         if not self.watch <= self.start <= self.until:
             raise BadInput(
-                f"mesh-in-the-loop: watch {self.watch}, start {self.start}, until {self.until} must not fall; change one"
+                f"mesh-in-the-loop: watch {self.watch}, start {self.start}, until {self.until} must not fall"
             )
 
     def weight_at(self, index: int, steps: int) -> float:
@@ -171,10 +174,10 @@ class MeshInTheLoop(Regularizer):
         at = torch.where(shown, y.floor() * width + x.floor(), 0.0).long()
         distance = (depth.flatten()[at] - z).view(-1, PIVOTS)
         cut = self.cut(boxes)
-        sees = (shown & there.flatten()[at]).view(-1, PIVOTS) & (distance > -cut)
-        value = torch.where(sees, distance.minimum(cut), 0.0).to(near)
-        given.stat(SUM, PIVOTS).index_add_(0, rows, value)
-        given.stat(COUNT, PIVOTS).index_add_(0, rows, sees.to(near))
+        sees = (shown & there.flatten()[at]).view(-1, PIVOTS)
+        weight = torch.where(distance > -cut, 1.0, BEHIND) * sees
+        given.stat(SUM, PIVOTS).index_add_(0, rows, (weight * distance.clamp(-cut, cut)).to(near))
+        given.stat(COUNT, PIVOTS).index_add_(0, rows, weight.to(near))
         near.index_add_(0, rows, (sees[:, 0] & (distance[:, 0].abs() < cut[:, 0])).to(near))
 
     def cut(self, boxes: Boxes) -> Tensor:
@@ -189,12 +192,8 @@ class MeshInTheLoop(Regularizer):
         total, count, spread = given.stat(SUM, PIVOTS), given.stat(COUNT, PIVOTS), splats.extra["spread"]
         chosen.copy_(torch.where(spread > 0, spread, chosen))
         self.choose(given)
-        used.copy_(torch.where((spread > 0) | (count[:, 0] > 0) & (near > 0), chosen, 0.0))
-        boxes = Boxes.of(splats, used)
-        given.stat(PLACES, PIVOTS, 3).copy_(boxes.places())
-        hidden = (used > 0)[:, None] & (count == 0)
-        total.copy_(torch.where(hidden, -self.cut(boxes).to(total), total))
-        count[hidden] = 1.0
+        used.copy_(torch.where((spread > 0) | (count > 0).all(1) & (near > 0), chosen, 0.0))
+        given.stat(PLACES, PIVOTS, 3).copy_(Boxes.of(splats, used).places())
         given.stat(DUE).fill_(given.index)
         for column in (total, count, near):
             column.mul_(0.5)

@@ -1,4 +1,4 @@
-"""Pivots: the centre and the eight corners of a box around a Gaussian, each with a trained value (MILo, section 4.1)."""
+"""Pivots: the centre and the eight corners of a box around a Gaussian, with a trained value each (MILo, 4.1)."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Boxes:
         return self.centres[:, None] + rotated(offsets, self.quats.repeat_interleave(PIVOTS, 0)).view(-1, PIVOTS, 3)
 
     def at(self, pivots: Tensor) -> tuple[Tensor, Tensor]:
-        """(K, 3) positions and (K,) values, lengths below 0 inside, of (K,) int64 pivots, numbered through all boxes."""
+        """(K, 3) positions and (K,) values, lengths below 0 inside, of (K,) int64 pivots."""
         box, corner = pivots // PIVOTS, pivots % PIVOTS
         centre, quat, half = (part.index_select(0, box) for part in (self.centres, self.quats, self.half))
         value = self.occupancies.flatten().index_select(0, pivots) * self.sizes[box]

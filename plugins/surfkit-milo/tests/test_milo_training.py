@@ -197,7 +197,13 @@ def test_the_recipe_has_the_published_values_and_its_row():
     MILO.refuse_unfit()
     term = MILO.pretrain.regularizers["mesh"]
     assert (term.depth, term.normal, term.inside, term.labels) == (0.05, 0.05, 0.005, 0.005)
-    assert (MILO.pretrain.steps, term.start, term.until, term.refresh, term.limit) == (18_000, 8_000, 18_000, 500, 600_000)
+    assert (MILO.pretrain.steps, term.start, term.until, term.refresh, term.limit) == (
+        18_000,
+        8_000,
+        18_000,
+        500,
+        600_000,
+    )
     short = rescale(MILO.pretrain, 0.1).regularizers["mesh"]
     assert (short.watch, short.start, short.until, short.refresh) == (500, 800, 1_800, 50)
     assert build(offered_tables()["methods"])["MILo"].pretrain == MILO.pretrain
