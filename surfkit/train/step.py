@@ -18,7 +18,6 @@ from surfkit.train.faults import require_finite_gradients, require_finite_losses
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
 from surfkit.train.loss_gradients import (
-    added,
     as_numbers,
     loss_gradients,
     pulled,
@@ -60,15 +59,14 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
     count = len(shape)
-    given = index, stage.steps, target, render.maps, render.seen[:count], state.points.stat, leaves
-    terms, by_maps = terms_with_maps(stage.regularizers, shape, RegularizerInput(*given))
-    total = total if by_maps is None else added(total, by_maps)
+    given = RegularizerInput(index, stage.steps, target, render.maps, render.seen[:count], state.points.stat, leaves)
+    terms, total = terms_with_maps(stage.regularizers, shape, given, total)
 
     # Backward: from the maps to the splats; the gradient that drives densification comes beside that of all losses.
     gradients = render.backward(total, chosen, stage.signal.absolute, count)
     drawn = render.maps, render.seen[:count], render.radii[:count]
     kept = render if stage.optimizer.pulls else None
-    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance, kept, terms)
+    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance, kept, given, terms)
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
@@ -77,9 +75,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     state.whole = False  # until the step is done
 
     # Update: terms on the points join the gradients on their way to the raw parameters, which the optimizer changes.
-    given = index, stage.steps, result.target, result.maps, result.seen, state.points.stat, result.leaves
-    terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
-    terms |= {name: terms[name] + value for name, value in result.terms.items()}
+    terms = regularizer_terms(stage.regularizers, result.shape, result.given, result.terms)
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
     edit = wanted(setup, state, told(setup, state, result)) if stage.policies else None
