@@ -108,8 +108,8 @@ def regularizer_terms(
 def terms_with_maps(
     regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput, total: Maps
 ) -> tuple[dict[str, Tensor], Maps]:
-    """What `Regularizer.with_maps` gives in a step, weighted, by key, with its graph to the splats; and the `total`
-    gradient of all losses by the maps, with theirs."""
+    """What `Regularizer.with_maps` gives in a step, weighted scalars by key, with the graph to the splats; and the
+    `total` gradient of all losses by the maps, (C, H, W) or (H, W) each, with theirs."""
     leaves = {name: value.detach().requires_grad_() for name, value in given.maps.present().items()}
     given, found = replace(given, maps=Maps(**leaves)), {}
     for name, term in regularizers.items():
