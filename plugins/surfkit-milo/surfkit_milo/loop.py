@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -63,10 +64,11 @@ class MeshInTheLoop(Regularizer):
     """Weight of 1 - |cos| of the angle between the normals."""
 
     inside: float = 0.005
-    """Weight of the cross entropy of the occupancies of centres, which are to be inside."""
+    """Weight of the cross entropy of the occupancies of centres that are not inside, as they are to be."""
 
     labels: float = 0.005
-    """Weight of the cross entropy of the occupancies of pivots with the side of the fused depth on which they are."""
+    """Weight of the cross entropy of the occupancies of pivots that are not on the side where the fused depth has
+    them."""
 
     watch: Steps = 5_000
     """Steps before depth maps are fused at the pivots."""
@@ -120,7 +122,7 @@ class MeshInTheLoop(Regularizer):
     def __call__(self, splats: Splats) -> Tensor:
         """The part for which no view is needed: centres are inside."""
         require_pivots(splats, "regularizers.KEY:mesh-in-the-loop")
-        return self.inside * _mean(softplus(SLOPE * splats.extra["occupancies"][:, 0]), splats.extra["spread"] > 0)
+        return self.inside * _mean(wrong(SLOPE * splats.extra["occupancies"][:, 0]), splats.extra["spread"] > 0)
 
     def with_maps(self, splats: Splats, given: RegularizerInput) -> Tensor | None:
         """See `Regularizer.with_maps`: what differs between the mesh and the Gaussians in the view of the step."""
@@ -154,7 +156,7 @@ class MeshInTheLoop(Regularizer):
         total, count = given.stat(SUM, PIVOTS), given.stat(COUNT, PIVOTS)
         has = splats.extra["spread"] > 0
         side = SLOPE * splats.extra["occupancies"] * torch.where(total > 0, -1.0, 1.0)  # of logits that are to fall
-        labels = self.labels * _mean(softplus(side), has[:, None] & (count > 0) & (total != 0))
+        labels = self.labels * _mean(wrong(side), has[:, None] & (count > 0) & (total != 0))
         term = self(splats) + labels
         if given.index >= self.start - self.refresh and (given.index - self.start) % self.refresh == 0:
             self.triangulate(splats.detached(), given)
@@ -221,6 +223,15 @@ def triangulated(given: RegularizerInput) -> np.ndarray:
     if used not in _TETRAHEDRA:
         _TETRAHEDRA[used] = tetrahedra(given.stat(PLACES, PIVOTS, 3)[used > 0].view(-1, 3))
     return _TETRAHEDRA[used]
+
+
+def wrong(logits: Tensor) -> Tensor:
+    """Cross entropy of occupancies, of any shape, whose logit is to be below 0, as far as it is above that of a half.
+
+    On the right side it is 0: Adam, which knows no small gradients, would else move values that no view corrects away
+    from the distances that they are.
+    """
+    return (softplus(logits) - math.log(2)).clamp_min(0)
 
 
 def _mean(values: Tensor, counts: Tensor) -> Tensor:
