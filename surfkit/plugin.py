@@ -76,9 +76,13 @@ from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.losses.transients import Transients
 from surfkit.losses.warped_patches import WarpedPatches
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.delaunay import tetrahedralised
+from surfkit.mesh.field import vertex_colors
 from surfkit.mesh.isosurface import isosurface
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.poisson import Poisson
+from surfkit.mesh.shade import draw_faces
+from surfkit.mesh.tetra import crossed_edges, oriented, triangles
 from surfkit.mesh.trust import Trust
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import Assign
@@ -286,8 +290,10 @@ __all__ = [
     "admitted",
     "camera_of",
     "checkpoint",
+    "crossed_edges",
     "choice",
     "components",
+    "draw_faces",
     "dump",
     "emit",
     "evolve",
@@ -303,6 +309,7 @@ __all__ = [
     "log_linear",
     "name_of",
     "normals_of",
+    "oriented",
     "read_json",
     "refuse_unfit_stage",
     "reject",
@@ -313,5 +320,8 @@ __all__ = [
     "seeds",
     "ssim_map",
     "standard_columns",
+    "tetrahedralised",
+    "triangles",
+    "vertex_colors",
     "write_json",
 ]

@@ -156,3 +156,12 @@ class Regularizer(Component):
         something from step to step; by default that of the splats alone, or of those that are seen.
         """
         return self(splats.take(given.seen) if self.only_seen else splats)
+
+    def with_maps(self, splats: Splats, given: RegularizerInput) -> Tensor | None:
+        """A further part of the term, unweighted, that is differentiable in the splats and in `given.maps`: it moves
+        the splats themselves, and by what was drawn of them. None for no such part, as by default.
+
+        It is asked before `in_step`, and only reads its columns: a step whose memory gives out asks once more. The
+        gradient that drives densification is without it.
+        """
+        return None

@@ -183,20 +183,38 @@ def triangles(tets: np.ndarray, inside: np.ndarray, points: np.ndarray) -> tuple
     Returns:
         (E, 2) int64 rows of points, the one inside first, and (F, 3) int64 rows of edges.
     """
+    edges, at = np.unique(crossed_edges(oriented(tets, points), inside).reshape(-1, 2), axis=0, return_inverse=True)
+    return edges, at.reshape(-1, 3)
+
+
+def oriented(tets: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(T, 4) tetrahedra with their corners in rising order, but for the first two where that orients them positively.
+
+    Args:
+        tets: (T, 4) rows of `points`.
+        points: (P, 3).
+    """
     tets = np.sort(tets, axis=1)  # which diagonal cuts a quadrilateral must not depend on the tile
     a, b, c, d = points[tets].transpose(1, 0, 2)
     turned = np.einsum("ni,ni->n", np.cross(b - a, c - a), d - a) < 0
-    tets = np.where(turned[:, None], tets[:, [1, 0, 2, 3]], tets)
+    return np.where(turned[:, None], tets[:, [1, 0, 2, 3]], tets)
+
+
+def crossed_edges(tets: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """(F, 3, 2) int64: each triangle of the surface as three edges that it crosses, the point inside first.
+
+    Args:
+        tets: (T, 4) rows of points, as `oriented` gives them.
+        inside: (P,) bool.
+    """
     case = (inside[tets] << np.arange(4)).sum(1)
     found = []
     for bits, table in enumerate(TRIANGLES):
         rows = tets[case == bits]
         ends = rows[:, np.array(TETRA_EDGES)[list(table)]] if table else np.empty((0, 3, 2), np.int64)
-        found.append(ends.reshape(-1, 3, 2))
-    ends = np.concatenate(found).reshape(-1, 2)
-    ends = np.where(inside[ends[:, :1]], ends, ends[:, ::-1])
-    edges, at = np.unique(ends, axis=0, return_inverse=True)
-    return edges, at.reshape(-1, 3)
+        found.append(ends.reshape(-1, 2))
+    ends = np.concatenate(found)
+    return np.where(inside[ends[:, :1]], ends, ends[:, ::-1]).reshape(-1, 3, 2)
 
 
 def used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -102,6 +102,7 @@ def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Ten
     step = RegularizerInput(1_000, 30_000, about, drawn, seen, _stats(columns, len(given)))
     for index in (1_000, 1_001):
         step, kept = replace(step, index=index), {key: value.clone() for key, value in columns.items()}
+        _check_with_maps(f"{name}.with_maps", regularizer, given, replace(step, stat=_stats(kept, len(given))))
         with unchanged(f"{name}.in_step", splats=given, target=about, maps=drawn, seen=seen):
             value = regularizer.in_step(given, step)
         assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
@@ -109,6 +110,18 @@ def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Ten
         resumed = twin(regularizer).in_step(given, replace(step, stat=_stats(kept, len(given))))
         assert torch.equal(value, resumed), f"{name}: a resumed run differs; draw from `target.seed`, keep in `stat`"
         _check_gradients(name, value, {key: each for key, each in given.named().items() if each.requires_grad})
+
+
+def _check_with_maps(name: str, regularizer: Regularizer, given: Splats, step: RegularizerInput) -> None:
+    """The part that moves maps, if there is one, is a finite number with finite gradients by splats and maps."""
+    leaves = {key: value.clone().requires_grad_() for key, value in step.maps.present().items()}
+    step = replace(step, maps=replace(step.maps, **leaves))
+    with unchanged(name, splats=given, target=step.target, maps=step.maps, seen=step.seen):
+        value = regularizer.with_maps(given, step)
+    if value is not None:
+        assert value.shape == () and torch.isfinite(value), f"{name} gives {value}, not one finite number"
+        own = {key: each for key, each in given.named().items() if each.requires_grad}
+        _check_gradients(name, value, own | leaves)
 
 
 def _stats(columns: dict[str, Tensor], count: int) -> Callable[..., Tensor]:

@@ -96,11 +96,27 @@ def loss_gradients(
 
 
 def regularizer_terms(
-    regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput
+    regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput, parts: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
-    """The weighted terms on the points that count in a step, scalars by key, with their graph to the splats."""
+    """The weighted terms on the points that count in a step, scalars by key, with their graph to the splats; `parts` of
+    them are known already (`terms_with_maps`)."""
     weights = {name: term.weight_at(given.index, given.steps) for name, term in regularizers.items()}
-    return {name: weight * regularizers[name].in_step(splats, given) for name, weight in weights.items() if weight > 0}
+    terms = {name: weight * regularizers[name].in_step(splats, given) for name, weight in weights.items() if weight > 0}
+    return terms | {name: terms[name] + value for name, value in parts.items()}
+
+
+def terms_with_maps(
+    regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput, total: Maps
+) -> tuple[dict[str, Tensor], Maps]:
+    """What `Regularizer.with_maps` gives in a step, weighted scalars by key, with the graph to the splats; and the
+    `total` gradient of all losses by the maps, (C, H, W) or (H, W) each, with theirs."""
+    leaves = {name: value.detach().requires_grad_() for name, value in given.maps.present().items()}
+    given, found = replace(given, maps=Maps(**leaves)), {}
+    for name, term in regularizers.items():
+        weight = term.weight_at(given.index, given.steps)
+        if weight > 0 and (value := term.with_maps(splats, given)) is not None:
+            found[name] = weight * value
+    return found, added(total, gradient(list(found.values()), leaves, shared=True)) if found else total
 
 
 def as_numbers(values: Mapping[str, Tensor]) -> dict[str, float]:

@@ -17,7 +17,14 @@ from surfkit.train.divide import balanced, own_edit, own_rows, refuse_apart, sha
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
-from surfkit.train.loss_gradients import as_numbers, loss_gradients, pulled, regularizer_terms, without_transients
+from surfkit.train.loss_gradients import (
+    as_numbers,
+    loss_gradients,
+    pulled,
+    regularizer_terms,
+    terms_with_maps,
+    without_transients,
+)
 from surfkit.train.next_view import neighbour, next_target
 from surfkit.train.optimizer import OptimizerInput
 from surfkit.train.point_blocks import spatial_order
@@ -53,13 +60,15 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
     target = without_transients(stage, index, render.maps, target, appearance)
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)
+    count = len(shape)
+    given = RegularizerInput(index, stage.steps, target, render.maps, render.seen[:count], state.points.stat, leaves)
+    terms, total = terms_with_maps(stage.regularizers, shape, given, total)
 
     # Backward: from the maps to the splats; the gradient that drives densification comes beside that of all losses.
-    count = len(shape)
     gradients = render.backward(total, chosen, stage.signal.absolute, count)
     drawn = render.maps, render.seen[:count], render.radii[:count]
     kept = render if stage.optimizer.pulls else None
-    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance, kept)
+    return StepResult(target, in_view, leaves, shape, splats, *drawn, losses, gradients, appearance, kept, given, terms)
 
 
 def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | None:
@@ -68,8 +77,7 @@ def update(setup: StageSetup, state: StageState, result: StepResult) -> Edit | N
     state.whole = False  # until the step is done
 
     # Update: terms on the points join the gradients on their way to the raw parameters, which the optimizer changes.
-    given = index, stage.steps, result.target, result.maps, result.seen, state.points.stat, result.leaves
-    terms = regularizer_terms(stage.regularizers, result.shape, RegularizerInput(*given))
+    terms = regularizer_terms(stage.regularizers, result.shape, result.given, result.terms)
     result.losses.update(as_numbers(terms))
     require_finite_losses(index, view, result.losses)
     edit = wanted(setup, state, told(setup, state, result)) if stage.policies else None

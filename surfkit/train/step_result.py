@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from surfkit.losses.base import Target
+from surfkit.losses.base import RegularizerInput, Target
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Maps, Render, Splats
 from surfkit.train.image_appearance import ImageAppearance
@@ -31,6 +31,8 @@ class StepResult:
         appearance: That of the photograph, with its gradient, if the stage learns any.
         render: What goes back once more, for an optimizer that wants other gradients too (`Optimizer.pulls`); None for
             others, as it holds much of a GPU's memory.
+        given: What terms on the points are told of the step.
+        terms: Parts of regularizers that have moved the maps already (`Regularizer.with_maps`), weighted.
     """
 
     target: Target
@@ -45,6 +47,8 @@ class StepResult:
     gradients: Gradients
     appearance: ImageAppearance | None
     render: Render | None
+    given: RegularizerInput
+    terms: Columns
 
     @property
     def rows(self) -> Tensor | None:
