@@ -14,7 +14,7 @@ from scenes import city
 
 from surfkit.raster.api import MAPS, Maps
 from surfkit.raster.native import module
-from surfkit.raster.native_rasterizer import NativeRasterizer, _Pass
+from surfkit.raster.native_rasterizer import NativeRasterizer, Pass
 from surfkit.raster.ssim import ssim
 from surfkit.train.adam import update
 
@@ -45,7 +45,7 @@ def parts_of(kind: str, rounds: int) -> dict[str, float]:
             update(value.clone() if name == "means" else value, value * 0, *moments[name], 1e-6, 1)
 
     parts = {
-        "project and bin": lambda: _Pass(splats, camera, NEAR),
+        "project and bin": lambda: Pass(splats, camera, NEAR),
         "forward": lambda: native.forward(2, [maps[name] for name in MAPS], threads),
         "backward": lambda: render.backward(cotangents),
         "backward with a second cotangent": lambda: render.backward(cotangents, color_only),

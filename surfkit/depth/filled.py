@@ -38,10 +38,10 @@ FILL_VERSION = 1
 class Filled(DepthEstimator):
     """Depth maps of another estimator whose holes are filled, as MetroGS (CVPR 2026) does.
 
-    Holes are the pixels that it trusts less than `sure`. What fills them must agree with the trusted pixels beside them
-    (see `fill`) and is left out where more views see through it than see a surface there. Filled pixels have a
-    confidence of `trust`: the depth loss weighs them by it, `start:stereo` begins there too, and nothing takes them for
-    what stereo knows.
+    Holes are the pixels that it trusts less than `sure`. What fills them must agree with the trusted pixels beside
+    them, as `fill` says, and is left out where more views see through it than see a surface there. Filled pixels have
+    a confidence of `trust`: the depth loss weighs them by it, `start:stereo` begins there too, and nothing takes them
+    for what stereo knows.
     """
 
     aligned: ClassVar[bool] = True

@@ -35,7 +35,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.runs.folder import Run, RunStage
 from surfkit.runs.photo_light import held_out_response
-from surfkit.runs.run_stage import Intervals, StageJob, begin, drawn_now, optimise, return_to_checkpoint, trainer_of
+from surfkit.runs.run_stage import Intervals, StageJob, begin, drawn_now, return_to_checkpoint, trainer_of
 from surfkit.runs.start import align_priors
 from surfkit.scene.scene import View
 from surfkit.train import checkpoint
@@ -111,8 +111,6 @@ def optimise_divided(job: StageJob, state: StageState | None, count: int, caches
         Fault: A process ended before its time; the last checkpoint is whole.
         KeyboardInterrupt: The run was asked to stop, and its state is saved.
     """
-    if count == 1:
-        return optimise(job, state)
     at, trainer = job.stage, trainer_of(job)
 
     def fresh() -> StageState:

@@ -176,12 +176,11 @@ class RecipeStages:
         write_light(run, self.light)
         if start is not None:
             discard_results(run, run.pretrain)
-            given, points_on = start.given, ctx.caches.points
-            job = StageJob(
-                run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start, points_on
-            )
-            state = optimise_divided(job, state, self.compute.processes, ctx.caches)
-            del start, given, job  # to free the memory of the photographs
+            given, count = start.given, self.compute.processes
+            parts = ctx.scene, ctx.rasterizer, ctx.intervals, given, self.meter, start
+            job = StageJob(run, run.pretrain, *parts, ctx.caches.points)
+            state = optimise(job, state) if count == 1 else optimise_divided(job, state, count, ctx.caches)
+            del start, given, parts, job  # to free the memory of the photographs
         elif self.is_shared and run.recipe.partition is None:
             state = load_state(run, run.pretrain, ctx.scene)
         ctx.keep("pretrain")

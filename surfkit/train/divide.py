@@ -9,7 +9,7 @@ one has 1.1 times its share after that, points move on to the next process until
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ from surfkit.densify.point_cap import PointCap
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import draws_itself
 from surfkit.primitives.draws import SharedDraws, normals
-from surfkit.primitives.edit import ROW_FIELDS, Edit, merge, sound
+from surfkit.primitives.edit import ROW_FIELDS, Edit, apply_in_place, merge, sound
 from surfkit.primitives.points import Points
 from surfkit.primitives.smoothing import INTERVAL
 from surfkit.raster.api import STANDARD, Rasterizer, Splats
@@ -183,6 +183,24 @@ def own_edit(edit: Edit, rows: slice) -> Edit:
         raise BadInput("--processes: a policy adds points or gives values in a way that does not work with several")
     parts = {name: None if (value := getattr(edit, name)) is None else value[rows] for name in ROW_FIELDS}
     return replace(edit, **parts)
+
+
+def edited(
+    processes: Processes | None,
+    primitive: Primitive,
+    points: Points,
+    edit: Edit,
+    generator: torch.Generator,
+    order: Callable[[Tensor], Tensor] | None,
+) -> Points:
+    """What `apply_in_place` makes of the points; with several processes the edit is for the points of all of them."""
+    if processes is None:
+        apply_in_place(primitive, points, edit, generator, order)
+        return points
+    rows = own_rows(processes, len(points))
+    with shared_draws(edit, rows, generator) as draws:
+        apply_in_place(primitive, points, own_edit(edit, rows), draws, order)
+    return balanced(processes, points)
 
 
 @contextmanager

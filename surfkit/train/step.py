@@ -12,8 +12,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import PointsEdited, emit
 from surfkit.losses.base import RegularizerInput
 from surfkit.primitives.drawing import refuse_wrong_maps
-from surfkit.primitives.edit import Edit, apply_in_place, fitted, observe
-from surfkit.train.divide import balanced, own_edit, own_rows, refuse_apart, shared_draws
+from surfkit.primitives.edit import Edit, fitted, observe
+from surfkit.train.divide import edited, refuse_apart
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.image_appearance import ImageAppearance
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
@@ -104,13 +104,7 @@ def densify(setup: StageSetup, state: StageState, edit: Edit) -> None:
 
     # Densify: all that the policies ask for is done at once.
     points, state.blocks = state.points.to_rearrange(), None  # which hold the columns
-    if setup.processes is None:
-        apply_in_place(setup.primitive, points, edit, state.generator, order)
-    else:  # the edit is for the points of all
-        rows = own_rows(setup.processes, len(points))
-        with shared_draws(edit, rows, state.generator) as draws:
-            apply_in_place(setup.primitive, points, own_edit(edit, rows), draws, order)
-        points = balanced(setup.processes, points)
+    points = edited(setup.processes, setup.primitive, points, edit, state.generator, order)
     if setup.count(points) == 0:
         raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
     state.points = observe(setup.primitive, points, setup.views, setup.stage.near)

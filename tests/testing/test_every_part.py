@@ -36,6 +36,7 @@ ELSEWHERE = {
     "method:splats": "tests/runs/test_pipeline.py and most others train with it",
     "method:import": "tests/runs/methods/test_imported.py has a file for it",
     "start:splats": "tests/start/test_splats.py has a file for it",
+    "start:pointmap": "tests/start/test_pointmap.py has maps for it",
     "method:stereo": "tests/runs/methods/test_method.py makes the depth maps for it",
     "feature-extractor:disk": "tests/apps/sfm/test_learnt.py has weights for it",
     "feature-extractor:aliked": "tests/apps/sfm/test_learnt.py has weights for it",

@@ -19,8 +19,8 @@ MOST_COLUMNS = 500_000
 
 @dataclass(frozen=True)
 class CutPoisson(Poisson):
-    """Screened Poisson reconstruction as mesh:poisson, of the points of depth maps that are not cut away
-    (GaussianSurfels, volumetric cutting); needs open3d.
+    """Screened Poisson reconstruction as mesh:poisson, of the points of depth maps that volumetric cutting leaves, as
+    in GaussianSurfels; needs open3d.
 
     At the edge of a foreground, and where splats are faint, the mean depth of a pixel lies between two surfaces, where
     there are no splats. So space is divided into cells, each splat adds opacity x density to the cells that its plane

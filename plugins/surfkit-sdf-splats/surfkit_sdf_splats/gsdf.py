@@ -215,8 +215,8 @@ def _splats() -> Stage:
 
 @dataclass(frozen=True)
 class GSDF(SplatsWithDistance):
-    """Splats and a neural signed distance that guide each other's samples, density, depth and normals (GSDF, Yu et al.
-    2024)."""
+    """Splats and a neural signed distance that guide each other's samples, density, depth and normals (GSDF, Yu et
+    al. 2024)."""
 
     splats: Stage = field(default_factory=_splats)
     """Optimisation of the splats. Its steps are those of the whole run."""

@@ -44,8 +44,8 @@ LEAST_WEIGHT = 1e-30
 
 @dataclass(frozen=True)
 class Hierarchy(LevelsOfDetail):
-    """A binary tree in which every two splats have a merged one above them, drawn by size on the screen (Hierarchical
-    3DGS, Kerbl et al. 2024).
+    """A binary tree in which every two splats have a merged one above them, drawn by size on the screen, as in
+    Hierarchical 3DGS (Kerbl et al. 2024).
 
     Splats are halved at the median of their longest axis down to single ones. A merged splat keeps the mean, the
     covariance and the opacity times area of its two children, weighted by these. Inner nodes then learn from renders of

@@ -261,7 +261,11 @@ SURFACE_TABLE = Table(
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
-        Row("+ planes where stereo knows nothing", {"depth": Filled(stereo=surface.SURFACE.depth)}, kept=False),
+        Row(
+            "+ planes where stereo knows nothing",
+            {"depth": Filled(), "depth.stereo": surface.SURFACE.depth},
+            kept=False,
+        ),
         Row("stereo alone", {"method": STEREO.method}, kept=False),
     ),
     columns=MESH_COLUMNS,
