@@ -193,7 +193,16 @@ def edited(
     generator: torch.Generator,
     order: Callable[[Tensor], Tensor] | None,
 ) -> Points:
-    """What `apply_in_place` makes of the points; with several processes the edit is for the points of all of them."""
+    """What `apply_in_place` makes of the points; with several processes the edit is for the points of all of them.
+
+    Args:
+        processes: Those that the points are divided over, if they are.
+        primitive: What the points are.
+        points: Of this process; changed in place.
+        edit: What is asked for.
+        generator: Of the splits; it ends in the same state in all processes.
+        order: (N, 3) positions to the (N,) order in which points are to stand.
+    """
     if processes is None:
         apply_in_place(primitive, points, edit, generator, order)
         return points

@@ -10,7 +10,7 @@ from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, CountCap, Elongation, LossGradient
-from surfkit.densify.base import Contribution, Densify, Filter, Policy, Signal, Step
+from surfkit.densify.base import ComparedView, Contribution, Densify, Filter, Policy, Signal, Step
 from surfkit.primitives import Flat3D, Gaussian3D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
@@ -40,12 +40,19 @@ def scene() -> Points:
     return Points.fresh({"means": torch.zeros(N, 3), "scales": torch.zeros(N, 2), "opacities": torch.zeros(N)})
 
 
+def compared() -> ComparedView:
+    draw = torch.Generator().manual_seed(1)
+    color, photo = (torch.rand(3, 12, 16, generator=draw) for _ in range(2))
+    return ComparedView(color, photo, lambda values: torch.full((N,), float(values.sum())))
+
+
 def step(index: int, **other) -> Step:
     splats = Splats("surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, None)
     facts = dict(
         index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), splats=splats,
         grad_norm=torch.full((N,), 1e-3), signed_norm=torch.full((N,), 1e-3),
         radii=torch.ones(N), image_px=100, views=Everything(), since_reset=1_000, rates={"means": 1e-4}, seed=index,
+        view=compared(),
     )  # fmt: skip
     return Step(**(facts | other))
 

@@ -10,6 +10,7 @@ from surfkit_milo.mesh_maps import draw_mesh
 from surfkit_milo.mesher import PivotMesh
 from surfkit_milo.pivots import PIVOTS, Boxes, crossings, tetrahedra, vertices
 
+from surfkit.mesh.poisson import require_open3d
 from surfkit.plugin import BadInput, Camera, Maps, MeshInput, RegularizerInput, Splats, Target
 from surfkit.testing.inputs import BALL_RADIUS, above, mesh_input
 
@@ -74,7 +75,10 @@ def test_long_edges_have_no_triangles():
 
 
 def test_depth_and_normals_are_those_of_the_plane_and_of_a_ray_caster():
-    o3d = pytest.importorskip("open3d")
+    try:
+        o3d = require_open3d("this test")
+    except BadInput as error:
+        pytest.skip(str(error))
     given, camera = boxes(), above(0.05, -0.1)
     bent = replace(given, occupancies=given.occupancies + 0.3 * torch.sin(40 * given.places()[..., 0]))
     pose, rays = camera.world_to_camera, camera.rays(torch.float64)

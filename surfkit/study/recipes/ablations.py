@@ -369,6 +369,7 @@ DENSIFY_TABLE = Table(
             {"pretrain.signal": ABSOLUTE.signal, "pretrain.densify": ABSOLUTE.densify},
             kept=False,
         ),
+        stereo_alone(on="ADC"),
     ),
 )
 
