@@ -50,7 +50,7 @@ def write_picture(path: Path, report: Mapping[str, Any]) -> bool:
             _panel(axes, name, entries, rows)
         labels = [_shortened(f"{row['label']}  (on {_number(entries, row['built_on'])})") for row in rows]
         panels[0].set_yticks(range(len(rows)), labels)
-        panels[0].invert_yaxis()
+        panels[0].set_ylim(len(rows) - 0.5, -0.5)
         figure.suptitle(printable(f"table:{report['table']}. {caption(report)}"), wrap=True, fontsize="medium")
         drawn, texts = panels[0].get_legend_handles_labels()
         found = dict(sorted(dict(zip(texts, drawn, strict=True)).items(), key=itemgetter(0)))
@@ -90,6 +90,7 @@ def _panel(axes: Axes, name: str, entries: Sequence[Mapping[str, Any]], rows: Se
         axes.plot(steps, places, "D", color=PUBLISHED, fillstyle="none", label="published difference")
     axes.axvline(0, color="0.2", linewidth=1)
     axes.set_xlabel(f"difference in {column.head}" + (" (lower is better)" if column.better == "lower" else ""))
+    axes.locator_params(axis="x", nbins=5)
     axes.grid(axis="x", color="0.88")
     axes.set_axisbelow(True)
 

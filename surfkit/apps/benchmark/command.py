@@ -106,7 +106,7 @@ class BenchmarkCommand:
         if found := look(protocol, root, scenes, contenders):
             for finding in found:
                 say(printable(finding.text))
-            say(f"surfkit: {root}: {len(found)} things are not as {protocol.tag} has them; nothing was trained")
+            say(f"surfkit: {root}: not as {protocol.tag} has it: {len(found)}, named above; nothing was trained")
             return FAULTY
         if self.check:
             tell(f"{root}: all that {protocol.tag} needs for {', '.join(scene.name for scene in scenes)} is there")

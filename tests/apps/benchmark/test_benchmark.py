@@ -100,7 +100,7 @@ def test_all_that_is_missing_is_told_at_once(monkeypatch, tmp_path, capsys, prot
         for needed in (*scene.needed, *scene.truth.needed()):
             (line,) = (line for line in lines if line.startswith(f"{scene.name}: data/{needed.path}: missing"))
             assert needed.what in line and protocol.sources[needed.source] in line
-    assert last == f"surfkit: data: {len(lines)} things are not as {protocol.tag} has them; nothing was trained"
+    assert last == f"surfkit: data: not as {protocol.tag} has it: {len(lines)}, named above; nothing was trained"
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
