@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,11 +75,13 @@ class BenchmarkCommand:
         if sum((self.check, self.describe, self.show)) > 1:
             raise BadInput("--check, --describe and --show each do one thing; give one")
         if self.describe:
+            self._refuse_unread(BenchmarkCommand(self.name, describe=True))
             for line in description(protocol):
                 tell(line)
             return 0
         out = self.out or Path("runs") / protocol.tag
         if self.show:
+            self._refuse_unread(BenchmarkCommand(self.name, self.root, show=True, out=self.out))
             if not (out / RESULTS_FILE).exists():
                 raise BadInput(f"--out {out}: no results of a benchmark in it; name their folder")
             return show(read_json(out / RESULTS_FILE, dict[str, Any]))
@@ -95,6 +97,13 @@ class BenchmarkCommand:
         rows = [(each.name, each.tag, str(len(each.scenes)), each.about) for each in PROTOCOLS.values()]
         print_table(("benchmark", "protocol", "scenes", "what it is"), rows)
         return 0
+
+    def _refuse_unread(self, read: BenchmarkCommand) -> None:
+        """BadInput for options that are not read: what is given and is not in `read`."""
+        for each in fields(self):
+            if getattr(self, each.name) != getattr(read, each.name):
+                way = "--describe" if read.describe else "--show"
+                raise BadInput(f"--{each.name}: {way} does not read it; leave it out")
 
     def _run(self, protocol: Protocol, root: Path, out: Path) -> int:
         if self.seeds < 1:

@@ -70,6 +70,8 @@ def tiny_run(root, out, *words):
         (["dtu", "--root", "d", "--recipes", "2dsg"], "--recipes: no recipe named '2dsg'; did you mean '2dgs'?"),
         (["dtu", "--root", "d", "--recipes", "2dgs", "2dgs"], "--recipes: 2dgs is there twice; name each once"),
         (["dtu", "--check", "--describe"], "--check, --describe and --show each do one thing; give one"),
+        (["dtu", "--describe", "--scenes", "scan24"], "--scenes: --describe does not read it; leave it out"),
+        (["dtu", "--show", "--seeds", "2"], "--seeds: --show does not read it; leave it out"),
         (["dtu", "--show"], "--out runs/dtu-1: no results of a benchmark in it"),
     ],
 )
