@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import json
-import platform
 import subprocess
 import time
 from pathlib import Path
 
 import torch
 
+from surfkit.apps.benchmark.provenance import processor
 from surfkit.core.codec import write_text
 from surfkit.raster import native
 
 RESULTS = Path(__file__).parent / "results"
-
-
-def processor() -> str:
-    """The processor's name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def commit() -> str:

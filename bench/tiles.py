@@ -12,23 +12,22 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
+from functools import cache
 from pathlib import Path
 
 import torch
-from emulated_training import EmulatedGpu
 from machine import save
 from torch import Tensor
 
 import surfkit
 from surfkit.raster.api import ALPHA_MIN, Splats
-from surfkit.raster.cuda.rasterizer import TILE_SIDE_PX, source
+from surfkit.raster.cuda.rasterizer import TILE_SIDE_PX, TileRasterizer, source
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.projection import footprints
 from surfkit.runs.run_method import splats_of
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import rotations
 
-NEAR = 1e-3
 FLASH_ALPHA = 1 / 256
 
 
@@ -117,27 +116,29 @@ def needed(conic: Tensor, opacity: Tensor, splat: Tensor, tile: Tensor, corner: 
 
 def listed(splats: Splats, camera: Camera, near: float, every: int) -> Tensor:
     """Sorted numbers of the pairs in the lists of the kernels."""
-    drawn = GPU.render(splats, camera, near)._pass
+    drawn = KERNELS.render(splats, camera, near)._pass
     _, _, entries, offsets = drawn.lists
     tile = torch.repeat_interleave(torch.arange(every), offsets.diff().cpu().long())
     return (drawn.index.cpu()[entries[:, 0].cpu().long()] * every + tile).sort().values
 
 
-class OnCpu(EmulatedGpu):
+class EmulatedKernels(TileRasterizer):
     """The kernels in the emulator, with the CPU's tensors."""
 
     def where(self) -> torch.device:
         return torch.device("cpu")
 
-    def program(self, name: str, **defines: int):
-        """See `TileRasterizer.program`."""
-        key = name, *sorted(defines.items())
-        if key not in self.made:
-            self.made[key] = Emulated(source(name, **defines))
-        return self.made[key]
+    def program(self, name: str, **defines: int) -> Emulated:
+        return compiled(name, tuple(sorted(defines.items())))
 
 
-GPU = OnCpu()
+@cache
+def compiled(name: str, defines: tuple[tuple[str, int], ...]) -> Emulated:
+    """A program of the kernels, for the emulator."""
+    return Emulated(source(name, **dict(defines)))
+
+
+KERNELS = EmulatedKernels()
 
 
 def main() -> None:
@@ -149,12 +150,13 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=5)
     given = parser.parse_args()
     ctx, made = surfkit.open(given.run)._loaded
-    splats = splats_of(ctx.run, made).splats
+    model = splats_of(ctx.run, made)
+    splats = model.splats
     views = surfkit.read(given.data, scale=given.scale, test_every=8).held_out[: given.views]
     counts: dict[str, list[float]] = {}
     lost: dict[str, int] = {}
     for view in views:
-        found = pairs(splats, view.camera, NEAR)
+        found = pairs(splats, view.camera, model.near)
         for name, numbers in found.items():
             counts.setdefault(name, []).append(len(numbers))
             lost[name] = lost.get(name, 0) + int((~torch.isin(found["needed"], numbers)).sum())

@@ -147,3 +147,10 @@ def test_the_check_sees_every_way_to_import():
     assert upward("from surfkit.losses import x", "primitives") == ["losses"]
     assert not upward("from surfkit.core import x\nfrom .adc import ADC\nimport torch", "densify")
     assert upward("from surfkit import Prune", "densify") == ["Prune"]  # the public names may lie on any floor
+
+
+def test_every_conftest_below_the_first_is_in_a_package():
+    """Two modules called `conftest` shadow each other: classes of the first lose their source, and so their texts."""
+    tests = Path(__file__).parent
+    found = [path for path in tests.rglob("conftest.py") if path.parent != tests]
+    assert found and not [path for path in found if not (path.parent / "__init__.py").exists()]

@@ -85,8 +85,8 @@ class EvaluateCommand:
     """Also measure the levels of detail of the run: size, frames per second, PSNR and SSIM of each, and of blocks that
     are selected for each view by their error in pixels."""
 
-    lod_pixels: float = 1.0
-    """Largest error of the blocks that are selected, in pixels."""
+    lod_pixels: float | None = None
+    """Largest error of the blocks that are selected, in pixels; 1 if it is not given."""
 
     geometry: Annotated[Comparison, tyro.conf.arg(name="")] = Comparison()
     """How the geometry is compared."""
@@ -102,9 +102,9 @@ class EvaluateCommand:
     def run(self) -> None:
         """Measure, and print the results."""
         zones = Zones(self.seen, self.seams)
-        if not 0 <= self.lod_pixels < float("inf"):
+        if self.lod_pixels is not None and not 0 <= self.lod_pixels < float("inf"):
             raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
-        if self.lod_pixels != 1 and not self.lod:
+        if self.lod_pixels is not None and not self.lod:
             raise BadInput(f"--lod-pixels {self.lod_pixels:g} is for levels of detail; add --lod")
         if self.compressed and (zones != Zones() or self.lod or self.out is not None or not self.target.is_dir()):
             raise BadInput("--compressed is for a run, without --seen, --seams, --lod and --out")
@@ -164,7 +164,8 @@ class EvaluateCommand:
             found = measure_zones(scene, made.photographed(made.draw), zones, rendered_depths(made.draw), seams)
             metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
         if tree is not None:
-            levels = measure_levels(made, tree, scene, ctx.rasterizer, self.lod_pixels)
+            pixels = 1.0 if self.lod_pixels is None else self.lod_pixels
+            levels = measure_levels(made, tree, scene, ctx.rasterizer, pixels)
             metrics = note_metrics(run.metrics, {"lod": levels})
         if self.compressed:
             note_compressed(opened(self.target), metrics)

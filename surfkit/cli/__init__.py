@@ -153,9 +153,7 @@ def _guarded(words: list[str]) -> int:
             return READER_LEFT
         return stop.code or 0
     except Exception as error:
-        if isinstance(
-            error.__cause__, KeyboardInterrupt
-        ):  # while a class was made, of which Python makes a RuntimeError
+        if isinstance(error.__cause__, KeyboardInterrupt):  # while a class was made: Python makes it a RuntimeError
             return _interrupted(words)
         if (found := _error_line(error, words)) is None:
             raise

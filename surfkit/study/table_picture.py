@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from surfkit.core.check import printable
-from surfkit.core.files import replacing
+from surfkit.core.files import remove, replacing
 from surfkit.study.metric_columns import TABLE_COLUMNS
 from surfkit.study.table_text import caption, columns_of, data_name, data_sets
 
@@ -37,6 +37,7 @@ def write_picture(path: Path, report: Mapping[str, Any]) -> bool:
     rows = [row for row in entries[0]["rows"] if row["built_on"]]
     names = _panels(report)
     if not names:
+        remove(path)  # of an earlier command with other rows or columns
         return False
     import matplotlib
     from matplotlib.figure import Figure  # without pyplot: no window system is asked for, and nothing is kept

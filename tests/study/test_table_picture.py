@@ -57,8 +57,10 @@ def test_bars_are_as_long_as_the_differences(tmp_path):
 
 
 def test_nothing_is_drawn_before_two_rows_can_be_compared(tmp_path):
-    assert not write_picture(tmp_path / "ablation.png", report(row("base"), row("+ gain", "base")))
-    assert not list(tmp_path.iterdir())
+    path = tmp_path / "ablation.png"
+    path.write_bytes(b"of an earlier command")
+    assert not write_picture(path, report(row("base"), row("+ gain", "base")))
+    assert not list(tmp_path.iterdir()), "what it showed is no longer so"
 
 
 def test_columns_that_have_no_differences_have_no_panel():

@@ -73,9 +73,9 @@ class RenderCommand:
     """Draw the levels of detail of the run (`surfkit lod`), as each frame needs them; prints how many splats that are,
     and the time."""
 
-    lod_pixels: float = 1.0
+    lod_pixels: float | None = None
     """With --lod: largest error of the blocks that are drawn, pixels; for lod:hierarchy largest size of a splat's
-    box."""
+    box. 1 if it is not given."""
 
     keep_frames: bool = False
     """Keep the folder of pictures beside the video, OUT.frames."""
@@ -87,9 +87,9 @@ class RenderCommand:
         for name, value in (("seconds", self.seconds), ("fps", self.fps)):
             if value is not None and not 0 < value <= 1e6:
                 raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
-        if not 0 <= self.lod_pixels < float("inf"):
+        if self.lod_pixels is not None and not 0 <= self.lod_pixels < float("inf"):
             raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
-        if self.lod_pixels != 1 and not self.lod:
+        if self.lod_pixels is not None and not self.lod:
             raise BadInput(f"--lod-pixels {self.lod_pixels:g} is for levels of detail; add --lod")
         if self.lod and self.compressed:
             raise BadInput("--lod and --compressed are two models of the run: leave out one of them")
@@ -137,7 +137,7 @@ class RenderCommand:
             fps = self.fps or flight.fps or FPS
             model = identity(self.run_folder, self.compressed)
             if levels is not None:
-                model += f" {self.lod_pixels!r} {identity(ctx.run.lod_record)}"
+                model += f" {levels.pixels!r} {identity(ctx.run.lod_record)}"
             if film:
                 make_video(out, Film(flight.cameras, draw, self.show, model, fps), self.keep_frames)
             else:
@@ -158,8 +158,8 @@ class RenderCommand:
     def levels_of(self, ctx: RunContext, made: Reconstruction) -> DrawnLevels:
         """What draws the levels of detail of the run."""
         model = splats_of(ctx.run, made)
-        tree = load_levels(ctx.run, model)
-        return DrawnLevels(tree, drawn_by(model.primitive, ctx.rasterizer), self.lod_pixels, self.show != "color")
+        tree, pixels = load_levels(ctx.run, model), 1.0 if self.lod_pixels is None else self.lod_pixels
+        return DrawnLevels(tree, drawn_by(model.primitive, ctx.rasterizer), pixels, self.show != "color")
 
     def flight(self, scene: Scene) -> CameraPath:
         """The cameras of all frames."""

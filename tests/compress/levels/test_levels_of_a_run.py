@@ -176,7 +176,7 @@ def test_damaged_levels_are_one_line(copy, spoil, text, capsys):
 def test_wrong_options_are_one_line(copy, capsys):
     for words, text in (
         (["evaluate", str(copy), "--lod", "--lod-pixels", "-1"], "--lod-pixels -1: give 0 or more"),
-        (["evaluate", str(copy), "--lod-pixels", "4"], "--lod-pixels 4 is for levels of detail; add --lod"),
+        (["evaluate", str(copy), "--lod-pixels", "1"], "--lod-pixels 1 is for levels of detail; add --lod"),
         (["evaluate", str(copy), "--lod", "--gt", "x.ply"], "--lod is for photographs"),
         (["lod", str(copy), "--metres-per-unit", "0"], "--metres-per-unit 0: it must be more than 0"),
         (["lod", str(copy / "pictures")], "no run folder"),
@@ -275,7 +275,7 @@ def test_levels_of_another_size_are_no_tree(copy, capsys):
 def test_wrong_options_of_a_rendering_are_one_line(copy, capsys):
     for words, text in (
         (["--lod", "--lod-pixels", "-1"], "--lod-pixels -1: give 0 or more"),
-        (["--lod-pixels", "4"], "--lod-pixels 4 is for levels of detail; add --lod"),
+        (["--lod-pixels", "1"], "--lod-pixels 1 is for levels of detail; add --lod"),
         (["--lod", "--compressed"], "two models of the run"),
     ):
         assert main(["render", str(copy), *words]) == 2
