@@ -13,7 +13,6 @@ its splats in this order. Gradients of a splat in several strips are sums of flo
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -103,12 +102,12 @@ class Exchange:
 
     def received(self) -> Splats:
         """(R,) splats that touch the strip of this process, in the order of the processes, with colours for sh."""
-        parts = [getattr(self.splats, name).detach() for name in STANDARD[:4]]
-        columns = [_flat(value).index_select(0, self.rows) for value in parts]
-        columns.append(colors(self.splats, self.camera, self.rows))
-        found = self.processes.exchanged(torch.cat(columns, 1), self.sent, self.from_each)
-        means, quats, scales, opacities, color = torch.split(found, [value.shape[1] for value in columns], 1)
-        return replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=color)
+        parts = [getattr(self.splats, name).detach().index_select(0, self.rows) for name in STANDARD[:4]]
+        parts.append(colors(self.splats, self.camera, self.rows))
+        means, quats, scales, opacities, color = [
+            self.processes.exchanged(part, self.sent, self.from_each) for part in parts
+        ]
+        return replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities, sh=color)
 
     def touched(self) -> Tensor:
         """(K,) int64, the splats that are sent, once each."""
@@ -116,9 +115,9 @@ class Exchange:
         return sent.nonzero()[:, 0]
 
     def returned(self, values: Tensor, most: bool = False) -> Tensor:
-        """(N, C) sums, or the `most`, of what strips have for each splat of this process; (R, C) of this strip."""
+        """(N, ...) sums, or the `most`, of what strips have for each splat of this process; (R, ...) of this strip."""
         back = self.processes.exchanged(values, self.from_each, self.sent)
-        found = values.new_zeros(len(self.splats), values.shape[1])
+        found = values.new_zeros(len(self.splats), *values.shape[1:])
         if most:
             return found.scatter_reduce_(0, self.rows[:, None].expand_as(back), back, "amax")
         return found.index_add_(0, self.rows, back)
@@ -160,25 +159,18 @@ class DividedRender(Render):
         means, quats, scales, opacities, color, signal, *more = self._sums(total, chosen, absolute)
         by_sh, touched = torch.zeros_like(self._splats.sh), self._exchange.touched()
         colors_backward(self._splats, self._camera, touched, color[touched], by_sh, means)
-        standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities[:, 0], sh=by_sh)
+        standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities, sh=by_sh)
         return Gradients(**standard, signal=signal, chosen=more[0] if more else None)
 
     def _sums(self, total: Maps, chosen: Maps | None, absolute: bool) -> list[Tensor]:
         """(N, ...) gradients by what the strips were sent, and the signals; what leads to them is freed."""
         here = self._drawn.backward(total, chosen, absolute)
         parts = [*here.tensors().values(), here.signal, *([] if here.chosen is None else [here.chosen])]
-        widths = [math.prod(value.shape[1:]) for value in parts]
-        together = torch.cat([_flat(value) for value in parts], 1)
-        del here, parts
-        return [part.contiguous() for part in torch.split(self._exchange.returned(together), widths, 1)]
+        del here
+        return [self._exchange.returned(parts.pop(0)) for _ in range(len(parts))]
 
     def _pixels(self, rank: int) -> slice:
         return pixel_rows(self._strips[rank], self._camera)
-
-
-def _flat(values: Tensor) -> Tensor:
-    """(N, numbers of a row) of (N, ...)."""
-    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def _key(camera: Camera) -> tuple[int, int, bytes]:
