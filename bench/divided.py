@@ -5,7 +5,7 @@
     python bench/divided.py --points 100000 --steps 6 --no-save
 
 Discs of terrain, all of them in view unless it is spread, with harmonics of degree 3, in the steps of recipe:2dgs after
-step 8,000: all its losses, Adam, statistics of densification. One thread for each process. Of each step, after two to
+step 8,000: all its losses, Adam, statistics of densification. One thread for each process. Of each step, after four to
 warm up: seconds by the clock, and CPU seconds of the process, with all its threads; medians, of two processes those of
 the slower one. On a machine with other work the CPU seconds tell, as then the clock also counts the waiting. Memory:
 the highest resident memory while the steps are made, above that after the imports and a step with few points; and what
@@ -41,7 +41,7 @@ from surfkit.train.state import StageState
 from surfkit.train.trainer import Trainer
 from surfkit.train.view_order import ViewOrder
 
-BEGIN, WARM, FEW = 8_000, 2, 200
+BEGIN, WARM, FEW = 8_000, 4, 200
 """Step to begin after, when every loss of recipe:2dgs counts; steps that are not counted; points of a first trial."""
 
 
