@@ -115,6 +115,8 @@ def process(rank: int, count: int, folder: str, args: argparse.Namespace, said: 
     if count > 1:
         dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=count)
     said.put((rank, measure(args, Processes(rank, count) if count > 1 else None)))
+    if count > 1:
+        dist.destroy_process_group()
 
 
 def together(count: int, args: argparse.Namespace) -> dict[str, Any]:

@@ -251,6 +251,7 @@ def _process(rank: int, work: Work, said: Any) -> None:
         with bars() if rank == 0 else nullcontext():
             if train_share(work, Processes.joined()):
                 said.put(("stopped", rank))
+        dist.destroy_process_group()  # else its threads may abort this process at its end
         return
     except Diverged as error:
         said.put(("diverged", (error.index, error.view, str(error).partition(": ")[2])))
