@@ -61,7 +61,7 @@ class NeighbourSelector:
 
         Args:
             at: Position of the camera.
-            depth: (H, W) camera z that it shows, 0 where there is none.
+            depth: (H, W) camera z that it shows, 0 where there is none; H and W may be a fraction of the camera's.
         """
         places = self.places(at, depth)
         if places.shape[1] < MIN_DEPTH_PLACES:
@@ -77,7 +77,7 @@ class NeighbourSelector:
         height, width = depth.shape
         y, x = (((torch.arange(PLACES_PER_SIDE) + 0.5) * size / PLACES_PER_SIDE).long() for size in (height, width))
         z = depth.detach()[y[:, None], x].flatten().float().cpu()
-        rays = self.cameras[at].rays()[:, y[:, None], x].flatten(1)
+        rays = self.cameras[at].resized(width, height).rays()[:, y[:, None], x].flatten(1)
         seen = (rays * z)[:, z > 0]
         return self.rotations[at].T @ (seen - self.shifts[at])
 

@@ -11,6 +11,7 @@ from surfkit.core.events import PhotoSkipped, emit
 from surfkit.losses.base import Neighbour, Target
 from surfkit.raster.api import Maps, Splats
 from surfkit.train.setup import StageSetup
+from surfkit.train.smaller import smaller
 from surfkit.train.state import StageState
 from surfkit.train.uploads import UploadedView
 from surfkit.train.view_order import ViewOrder
@@ -35,7 +36,8 @@ def next_target(setup: StageSetup, state: StageState) -> tuple[int, Target]:
         at = state.order.next(state.generator)
         if at in state.skipped or (shown := _readable(setup, state, at, setup.uploads.get(at))) is None:
             continue
-        return at, Target(setup.views[at], shown.in_floats(), shown.prior, shown.mask, seed=state.seed)
+        target = Target(setup.views[at], shown.in_floats(), shown.prior, shown.mask, seed=state.seed)
+        return at, smaller(target, setup.stage.divisor_at(state.index + 1))
     raise BadInput(f"none of the {len(setup.views)} photographs can be read, {setup.views[0].path} for one")
 
 
@@ -58,9 +60,11 @@ def neighbour(setup: StageSetup, state: StageState, splats: Splats, shown: int, 
     for at in (*found[first:], *found[:first]):
         if at in state.skipped or (second := _readable(setup, state, at, setup.uploads.aside(at))) is None:
             continue
-        drawn = setup.draws.render(splats, setup.views[at].camera, setup.stage.near, True, False).maps
+        whole = Target(setup.views[at], second.in_floats(), mask=second.mask)
+        other = smaller(whole, setup.stage.divisor_at(state.index + 1))
+        drawn = setup.draws.render(splats, other.view.camera, setup.stage.near, True, False).maps
         shape = replace(drawn, color=None, distortion=None)
-        return Neighbour(setup.views[at], second.in_floats(), shape, second.mask)
+        return Neighbour(other.view, other.photo, shape, other.mask)
     return None
 
 

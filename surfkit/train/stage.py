@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from surfkit.appearance.base import Appearance
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, require_within
 from surfkit.core.registry import choice
-from surfkit.core.schedule import Interval, LearningRate
+from surfkit.core.schedule import Interval, LearningRate, Steps
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal
 from surfkit.densify.signal import LossGradient
@@ -61,6 +62,12 @@ class Stage:
     """Steps between degrees of the spherical harmonics, from 0 up to the primitive's; a stage that goes on from a model
     begins at the model's degree."""
 
+    quarter_until: Steps = 0
+    """Steps up to which photographs are shown at a quarter of their width and height; 0 for none."""
+
+    half_until: Steps = 0
+    """Steps up to which photographs are shown at half of their width and height, after those at a quarter."""
+
     near: float = 0.005
     """Nothing nearer to a camera than this is drawn, as a share of the scene extent."""
 
@@ -72,6 +79,7 @@ class Stage:
             raise BadInput(f"a stage has {self.steps} steps; give 1 to {MAX_STAGE_STEPS}")
         if self.sh_every < 1:
             raise BadInput(f"sh_every is {self.sh_every}; it must be 1 or more steps")
+        require_within({"quarter_until": (0, math.inf), "half_until": (0, math.inf)}, self)
         if unknown := set(self.signal.terms or ()) - set(self.losses):
             raise BadInput(f"signal.terms names {', '.join(sorted(unknown))}; the losses are {', '.join(self.losses)}")
 
@@ -86,6 +94,10 @@ class Stage:
     def weights_at(self, index: int) -> dict[str, float]:
         """Weights of the losses that count in step `index` of 1..`steps`, by key."""
         return {name: weight for name, loss in self.losses.items() if (weight := loss.weight_at(index, self.steps)) > 0}
+
+    def divisor_at(self, index: int) -> int:
+        """By which width and height of the photograph are divided in step `index` of 1..`steps`."""
+        return 4 if index <= self.quarter_until else 2 if index <= self.half_until else 1
 
     def is_paired(self, index: int) -> bool:
         """Whether step `index` looks at a second view."""

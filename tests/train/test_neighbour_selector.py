@@ -53,6 +53,12 @@ def test_neighbours_stand_at_an_angle_see_the_same_and_are_as_far():
     assert NeighbourSelector.of(cameras[:1]).neighbours(0, depth) == []
 
 
+def test_a_depth_map_of_half_the_size_shows_the_same_places():
+    cameras = [facing(15)]
+    whole, half = (NeighbourSelector.of(cameras).places(0, torch.full(size, 2.0)) for size in ((30, 40), (15, 20)))
+    assert whole.shape == half.shape and (whole - half).abs().max() < 2 * 2.0 / 60, "two pixels of 60 at a depth of 2"
+
+
 def test_views_that_cannot_show_the_places_are_left_out_and_no_others(monkeypatch):
     """300 cameras above a plane, turned this way and that, some of them with a principal point beside the picture."""
     draw, cameras = torch.Generator().manual_seed(0), []

@@ -36,6 +36,8 @@ GAUSSIAN_SURFELS = Recipe(
         },
         regularizers={"opacity": BimodalOpacity()},
         densify=ADC(until=7_500, cull_opacity=0.1, reset_every=1_000, reset_opacity=0.12),
+        quarter_until=2_000,
+        half_until=5_000,
     ),
     mesh=CutPoisson(depth="expected"),
 )
