@@ -42,9 +42,9 @@ def colmap(folder: str, source: str, photographs: tuple[int, int | None], longes
     )
 
 
-def gauu(name: str, folder: str, preset: PresetName, training: tuple[int, int]) -> BenchmarkScene:
+def gauu(name: str, folder: str, scanned: str, preset: PresetName, training: tuple[int, int]) -> BenchmarkScene:
     """A scene of GauU-Scene: 1 unit is 100 m, in the photographs and in the scan."""
-    scan = Needed(f"ground_truth/{folder}.ply", "laser scan, in the frame of the model", "scan", points=(10**6, None))
+    scan = Needed(f"{folder}/{scanned}.ply", "laser scan, in the frame of the model", "scan", points=(10**6, None))
     return BenchmarkScene(
         name,
         folder,
@@ -60,9 +60,9 @@ GAUU_SCENE = Protocol(
     version=1,
     about="GauU-Scene: three university campuses from the air, against laser scans",
     scenes=(
-        gauu("residence", "LFLS", "gauu-residence", (958, 958)),
-        gauu("russian", "SMBU", "gauu-russian", (500, 508)),
-        gauu("modern", "CUHK_UPPER_COLMAP", "gauu-modern", (625, 638)),
+        gauu("residence", "LFLS", "LFLS", "gauu-residence", (958, 958)),
+        gauu("russian", "SMBU", "smbu", "gauu-russian", (500, 508)),
+        gauu("modern", "CUHK_UPPER_COLMAP", "cuhksz_upper_campus", "gauu-modern", (625, 638)),
     ),
     contenders=(
         Contender(
@@ -114,7 +114,7 @@ GAUU_SCENE = Protocol(
     columns=CITY_COLUMNS,
     sources={
         "photographs": "GauU-Scene V2, the COLMAP folders of its page, https://saliteta.github.io/CUHKSZ_SMBU",
-        "scan": "GauU-Scene V2, the scans on its page, https://saliteta.github.io/CUHKSZ_SMBU; named after the folder",
+        "scan": "GauU-Scene V2, the scans on its page, https://saliteta.github.io/CUHKSZ_SMBU",
     },
     rules=("Test photographs are every k-th in the order of COLMAP's numbers (split:gauu-scene).", *CITY_RULES),
     published_in=CITY_PAPER,

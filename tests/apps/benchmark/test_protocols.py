@@ -19,7 +19,7 @@ from tests.apps.benchmark.made_up import dtu, flown, shrunk, tanks, truth_points
 from tests.data_set_folders import with_tests_apart
 
 DIGESTS = {
-    "gauu-scene-1": "da3a641731ad",
+    "gauu-scene-1": "102451fd3fba",
     "matrixcity-1": "d44581545007",
     "tanks-and-temples-1": "5249f10f2e91",
     "dtu-1": "80ce102b7e95",
@@ -88,7 +88,7 @@ def sound(protocol, root, *rows):
 
 def test_a_folder_of_gauu_scene(tmp_path):
     write_colmap(tmp_path / "LFLS", flown())
-    write_cloud(tmp_path / "ground_truth/LFLS.ply", truth_points(flown()))
+    write_cloud(tmp_path / "LFLS/LFLS.ply", truth_points(flown()))
     protocol = shrunk(GAUU_SCENE, "residence")
     sound(protocol, tmp_path, "2dgs")
     (scene,) = protocol.scenes
