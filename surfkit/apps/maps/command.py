@@ -166,6 +166,7 @@ def show(out: Path, record: dict[str, Any]) -> None:
         rows.append(("ground that is seen", f"{found['ground_seen']:.1%} of the surface"))
         told = f"{found['without_terrain']:.1%} of it: no ground within {found['reach']:g} {unit}"
         rows.append(("without terrain", told))
+        rows.append(("surface below the terrain", f"{found['below_terrain']:.1%} of it"))
     if found := record.get("precision"):
         told = (
             f"median {found['median']:.3g}, 90 % under {found['percentile_90']:.3g} {unit}" if found["known"] else "-"

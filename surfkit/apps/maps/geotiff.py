@@ -74,7 +74,7 @@ class GeoTiffSettings:
 
         folder = self.folder / f"{name}{TILES_SUFFIX}"
         folder.mkdir(exist_ok=True)
-        raster = Raster(folder, self.grid, self.crs, kind, self.double)
+        raster = Raster(folder, self.grid, self.crs, kind, self.double, name)
         with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
             yield raster
         refuse_full(self.folder)

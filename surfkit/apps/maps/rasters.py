@@ -25,6 +25,19 @@ CHANNELS = {
     "shades": ("Gray",),
     "numbers": ("Gray",),
 }
+BANDS = {
+    "dsm.tif": ("height of the surface", True),
+    "dsm-other.tif": ("height of the other surface", True),
+    "difference.tif": ("height less that of the other surface", True),
+    "dtm.tif": ("height of the ground", True),
+    "ndsm.tif": ("height above ground", True),
+    "ground-distance.tif": ("distance to ground that is seen", True),
+    "precision.tif": ("expected error of the height", True),
+    "rays.tif": ("photographs that confirm the height", False),
+    "hillshade.tif": ("shaded relief", False),
+    "orthophoto-photographs.tif": ("number of the photograph", False),
+}
+"""What the band of a file has, and whether it is a length in the unit of the map."""
 FACTS_TAG = "surfkit"
 """Tag of a tile for what was counted when it was drawn."""
 
@@ -39,6 +52,7 @@ class Raster:
         crs: Coordinate reference system, of rasterio.
         kind: What it shows.
         double: Whether heights need 64-bit floats.
+        name: Of the finished file, which tells what its band has (`BANDS`).
     """
 
     folder: Path
@@ -46,6 +60,7 @@ class Raster:
     crs: Any
     kind: Kind
     double: bool
+    name: str = ""
 
     @property
     def dtype(self) -> str:
@@ -112,6 +127,11 @@ class Raster:
             if self.nodata is not None:
                 ElementTree.SubElement(band, "NoDataValue").text = repr(self.nodata)
             ElementTree.SubElement(band, "ColorInterp").text = color
+            if self.name in BANDS:
+                described, is_length = BANDS[self.name]
+                ElementTree.SubElement(band, "Description").text = described
+                if is_length and (unit := length_unit(self.crs)):
+                    ElementTree.SubElement(band, "UnitType").text = unit
             for tile in tiles:
                 left, top, width, height = map(int, tile.stem.split("-"))
                 source = ElementTree.SubElement(band, "SimpleSource")
@@ -129,6 +149,14 @@ class Raster:
 
     def _file(self, window: Window) -> Path:
         return self.folder / f"{window.left}-{window.top}-{window.width}-{window.height}.tif"
+
+
+def length_unit(crs: Any) -> str | None:
+    """The unit of lengths on a map, as GDAL calls it; None where it is not known. That of a local system is in its text
+    alone."""
+    if crs.linear_units != "unknown":
+        return str(crs.linear_units)
+    return "metre" if 'UNIT["metre"' in crs.to_wkt() else None
 
 
 def window_of(window: Window) -> Any:

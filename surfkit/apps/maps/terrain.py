@@ -32,7 +32,7 @@ from surfkit.apps.maps.map_grid import MapGrid, Window
 from surfkit.apps.maps.rasters import NODATA
 from surfkit.apps.maps.surface_model import has_colors
 from surfkit.core.check import BadInput
-from surfkit.core.events import Progress, emit
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
 
@@ -48,6 +48,8 @@ SLOPE_TOLERANCE = 1.25
 """Metres by which a cell may be farther from the ground, for each unit of slope (Pingel et al.)."""
 LEAST_SHARE = 0.25
 """Share of the cells within a coarse one that are ground, from which it is ground that is seen."""
+MAX_BELOW_SHARE = 0.005
+"""Share of the surface below the terrain, from which one is told."""
 FADE, FADE_RADII, FADE_WEIGHT = 1.0, 3.0, 0.05
 """Width of the strip in coarse cells, its radius in widths, and weight of the terrain, with which heights go over from
 ground that is seen to ground that is not."""
@@ -287,10 +289,18 @@ def write_terrain(
             found.append(facts)
             emit(Progress("drawing the terrain", at + 1, len(windows)))
     total = {name: sum(facts[name] for facts in found) for name in found[0]}
-    shares = {name: round(total[name] / max(1, total["cells"]), 6) for name in ("seen", "untold")}
+    shares = {name: round(total[name] / max(1, total["cells"]), 6) for name in ("seen", "untold", "below")}
+    if shares["below"] > MAX_BELOW_SHARE:
+        emit(
+            Warned(
+                f"{shares['below']:.1%} of the surface lies below the terrain, where the mesh has pits or noise, as "
+                f"under trees: {names[1]} is negative there; do not measure heights there"
+            )
+        )
     return {
         "ground_seen": shares["seen"],
         "without_terrain": shares["untold"],
+        "below_terrain": shares["below"],
         "coarse_cell": sheet.grid.gsd * ground.factor,
         "reach": ground.reach,
     }
@@ -300,14 +310,15 @@ def terrain_tile(
     heights: DatasetReader, ground: Ground, window: Window
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], dict[str, Any]]:
     """Terrain, heights above it, and distances to ground that is seen, (H, W) float64 each with NaN for no data, and
-    what is counted of a tile: cells with a surface, those that are ground, and those without terrain."""
+    how many cells of a tile have a surface, are ground, have no terrain, and lie below it."""
     width = FADE * ground.factor
     margin = int(FADE_RADII * width + 0.5)
     surface = with_margin(heights, window, margin)
     around = Window(window.left - margin, window.top - margin, window.width + 2 * margin, window.height + 2 * margin)
     terrain = ground.over(ground.terrain, around)
     with np.errstate(invalid="ignore"):
-        seen = np.abs(surface - terrain) <= ground.over(ground.tolerance, around)
+        tolerance = ground.over(ground.tolerance, around)
+        seen = np.abs(surface - terrain) <= tolerance
     # By weights, so that there is no step where ground that is seen ends; a Gaussian is the same in all tiles.
     rest, weight = (
         ndimage.gaussian_filter(each, width, mode="constant", truncate=FADE_RADII)
@@ -315,10 +326,12 @@ def terrain_tile(
     )
     terrain = np.where(seen, surface, terrain + rest / (weight + FADE_WEIGHT))
     inner = slice(margin, margin + window.height), slice(margin, margin + window.width)
-    surface, terrain, seen = surface[inner], terrain[inner], seen[inner]
+    surface, terrain, seen, tolerance = surface[inner], terrain[inner], seen[inner], tolerance[inner]
     distance = np.where(seen, 0.0, ground.over(ground.distance, window))
     there = (np.isfinite(surface) | ground.is_within(window)) & (distance <= ground.reach)
     terrain, distance = np.where(there, terrain, np.nan), np.where(there, distance, np.nan)
     counted = np.isfinite(surface)
-    facts = {"cells": counted.sum(), "seen": (seen & there).sum(), "untold": (counted & ~there).sum()}
-    return (terrain, surface - terrain, distance), {name: int(value) for name, value in facts.items()}
+    with np.errstate(invalid="ignore"):
+        below = there & (surface < terrain - tolerance)
+    facts = {"cells": counted, "seen": seen & there, "untold": counted & ~there, "below": below}
+    return (terrain, surface - terrain, distance), {name: int(cells.sum()) for name, cells in facts.items()}

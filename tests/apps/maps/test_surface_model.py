@@ -6,7 +6,8 @@ from needs import needs
 
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.map_grid import MapGrid, map_crs
-from surfkit.apps.maps.rasters import NODATA
+from surfkit.apps.maps.owned_files import PRODUCT_FILES
+from surfkit.apps.maps.rasters import BANDS, NODATA
 from surfkit.apps.maps.surface_model import draw_surface, needs_double
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE
 from surfkit.core.check import BadInput
@@ -110,6 +111,25 @@ def test_geotiffs_are_read_back(surface, tmp_path):
         assert np.abs(colors[0] - 255 * (x - UTM[0]) / 60)[inside].max() < 1.01
         assert np.abs(colors[1] - 255 * (y - UTM[1]) / 60)[inside].max() < 1.01
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dsm.tif", "orthophoto.tif"]
+
+
+@pytest.mark.parametrize(
+    ("crs", "metres", "unit"),
+    [
+        ("EPSG:32633", 1.0, "metre"),
+        ("EPSG:2263", 0.3048006096012192, "US survey foot"),
+        (None, 1.0, "metre"),
+        (None, None, None),
+    ],
+)
+def test_bands_say_what_they_have_and_in_which_unit(surface, tmp_path, crs, metres, unit):
+    written(surface, tmp_path, 2048, frame=Frame(np.zeros(3), 1.0, metres, crs))
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        assert (file.descriptions, file.units) == (("height of the surface",), (unit,))
+
+
+def test_bands_are_named_after_the_files_that_exist():
+    assert set(BANDS) == {name for name in PRODUCT_FILES.values() if name.endswith(".tif")} - {"orthophoto.tif"}
 
 
 def test_tiles_change_no_bit(surface, tmp_path, monkeypatch):

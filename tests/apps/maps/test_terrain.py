@@ -138,6 +138,23 @@ def test_a_surface_that_is_all_roof_is_taken_for_ground(tmp_path):
     assert np.abs(read(tmp_path / "dtm.tif") - 50).max() < 1e-5 and read(tmp_path / "ndsm.tif").max() == 0
 
 
+@pytest.mark.parametrize("depth", [0.3, 8.0])
+def test_a_surface_below_the_terrain_is_told(tmp_path, heard, depth):
+    """Pits below trees, in 15 x 15 m of 1 % of the map; of the depth of noise they are ground."""
+
+    def pits(x, y):
+        none = np.zeros(x.shape, bool)
+        where = (np.abs(x - 30) < 7.5) & (np.abs(y - 30) < 7.5) & (np.floor(x) % 5 < 1)
+        return np.where(where, -depth, 0.0), none, none
+
+    record = make_maps(MeshWithPhotos(scene(plane, objects=pits), FRAME), SETTINGS, tmp_path)
+    above = read(tmp_path / "ndsm.tif")
+    share = float((above < -1).mean())
+    assert abs(record["terrain"]["below_terrain"] - share) < 0.002
+    told = [each for each in heard if "below the terrain" in str(each)]
+    assert (share > 0.005, len(told)) == ((True, 1) if depth > 1 else (False, 0))
+
+
 def test_ridges_stay(tmp_path):
     """An opening cuts ridges off; steep ones need a larger --terrain.slope."""
     errors = {}
