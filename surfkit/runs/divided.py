@@ -25,7 +25,7 @@ import torch
 import torch.distributed as dist
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import FileWritten, StageBegan, StageEnded, emit, say
+from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.files import DISK_FULL
 from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import is_out_of_memory, peak_memory_bytes
@@ -120,6 +120,8 @@ def optimise_divided(job: StageJob, state: StageState | None, count: int, caches
         checkpoint.save(at.checkpoint, fresh())
     else:
         say(f"{at.out}: going on after step {state.index} of {at.stage.steps}")
+    if count > (cores := os.cpu_count() or 1):
+        emit(Warned(f"--processes {count}: this machine has {cores} cores, so they wait for each other; give less"))
     budget = replace(caches, cache=f"{max(1, caches.bytes() // count // 1_000_000)}MB")
     threads = max(1, torch.get_num_threads() // count)
     while True:
