@@ -4,8 +4,9 @@ Large Datasets)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -29,15 +30,21 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Splats
+from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
+from surfkit.train import checkpoint
 from surfkit.train.adam import adam_step
 from surfkit.train.faults import Diverged, require_finite_losses, require_finite_values
 from surfkit.train.loss_gradients import loss_gradients, pulled
+from surfkit.train.state import StageState
+from surfkit.train.view_order import ViewOrder
 
 RATES = {"sh0": 5e-4, "sh_rest": 5e-4 / 20, "opacities": 1e-2, "scales": 1e-3}
 """Learning rates of inner nodes, as published; positions, rotations and all else stay. Of the higher harmonics as in
 3DGS, a twentieth of that of the first."""
 LOSSES = {"l1": L1(), "ssim": SSIM()}
+KEPT_EVERY = 500
+"""Steps between states that are kept."""
 LEAST_WEIGHT = 1e-30
 """Of a splat in a merge, where opacity times area is 0 in float32."""
 
@@ -86,24 +93,36 @@ class Hierarchy(LevelsOfDetail):
         return self.optimised(given, tree) if self.steps else tree
 
     def optimised(self, given: LodInput, tree: SplatTree) -> SplatTree:
-        """The tree after the optimisation of its inner nodes (section 5); as it was, with a warning, if it diverges."""
+        """The tree after the optimisation of its inner nodes (section 5); as it was, with a warning, if it diverges.
+
+        Every `KEPT_EVERY` steps the state is kept in `given.folder`; an interrupted call goes on from there.
+        """
         pictures = renders(given, given.views)
-        generator = torch.Generator().manual_seed(given.seed)
-        inner, views = InnerNodes.of(tree), given.views
+        inner, path = InnerNodes.of(tree), given.folder / "hierarchy.safetensors"
         try:
-            for index in range(1, self.steps + 1):
-                if index % len(views) == 1 % len(views):
-                    order = torch.randperm(len(views), generator=generator).tolist()
-                at = order[(index - 1) % len(views)]
-                share = float(torch.rand((), generator=generator, dtype=torch.float64))
-                inner.step(given, views[at], pictures[at], log_linear(self.finest, self.coarsest, share), index)
-                emit(Progress("optimising the hierarchy", index, self.steps))
+            for state in inner.steps(given, pictures, self, kept_state(path, inner.points)):
+                if state.index % KEPT_EVERY == 0 and state.index < self.steps:
+                    checkpoint.save(path, state)
+                emit(Progress("optimising the hierarchy", state.index, self.steps))
         except Diverged as error:
             emit(Warned(f"the hierarchy is not optimised: {error}"))
             return tree
         finally:
             pictures.close()
         return SplatTree(tree.order, inner.levels(), tree.blocks)
+
+
+def kept_state(path: Path, like: Points) -> StageState | None:
+    """The state that an interrupted call has kept in a file; None for none, and for one of other points than these."""
+    try:
+        found = checkpoint.load_last(path)
+    except BadInput as error:
+        emit(Warned(f"the optimisation of the hierarchy begins anew: {error}"))
+        return None
+    if found is None:
+        return None
+    ours, theirs = ({n: v.shape for n, v in each.params.items()} for each in (like, found[0].points))
+    return found[0] if ours == theirs else None
 
 
 def merged_tree(model: SplatModel, tile_points: int) -> SplatTree:
@@ -172,6 +191,29 @@ class InnerNodes:
             replace(level, params={**level.params, **{n: v[a:b].clone() for n, v in self.points.params.items()}})
             for level, a, b in zip(self.tree.levels[1:], starts[1:-1].tolist(), starts[2:].tolist(), strict=True)
         )
+
+    def steps(
+        self, given: LodInput, pictures: Cache[Tensor], lod: Hierarchy, state: StageState | None
+    ) -> Iterator[StageState]:
+        """Take the steps that are left of `lod.steps`, and give the state after each.
+
+        Args:
+            given: With the views, the rasterizer and the seed.
+            pictures: (3, H, W) uint8 of the full model, of each view.
+            lod: With the granularities, drawn evenly in the logarithm.
+            state: To go on from; None begins.
+        """
+        if state is None:
+            state = StageState(self.points, ViewOrder(len(given.views)), torch.Generator().manual_seed(given.seed))
+        state.move(next(iter(self.points.params.values())).device)
+        self.points = state.points
+        while state.index < lod.steps:
+            at = state.order.next(state.generator)
+            share = float(torch.rand((), generator=state.generator, dtype=torch.float64))
+            state.index += 1
+            granularity = log_linear(lod.finest, lod.coarsest, share)
+            self.step(given, given.views[at], pictures[at], granularity, state.index)
+            yield state
 
     def step(self, given: LodInput, view: View, picture: Tensor, granularity: float, index: int) -> float:
         """Draw one view at a granularity, compare it with what the full model draws, and move the inner nodes.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.compress.levels import Hierarchy
+from surfkit.compress.levels import Hierarchy, hierarchy
 from surfkit.compress.levels.cut import cut
 from surfkit.compress.levels.hierarchy import InnerNodes, merged_tree
 from surfkit.compress.levels.moments import Shapes
@@ -253,6 +253,40 @@ def test_optimisation_lowers_the_loss_at_every_granularity_and_leaves_the_leaves
             pairs = zip(made, given.views, wanted, strict=True)
             loss.append(sum(float((drawn(splats, v.camera) - full).abs().mean()) for splats, v, full in pairs))
         assert loss[1] < 0.97 * loss[0], granularity
+
+
+def test_an_interrupted_optimisation_goes_on_with_the_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr(hierarchy, "KEPT_EVERY", 10)
+    given, lod = replace(lod_input(count=300), folder=tmp_path), Hierarchy(tile_points=50, steps=40, finest=0.05)
+    whole = replace(given, folder=tmp_path / "whole")
+    whole.folder.mkdir()
+    expected = lod.build(whole)
+    step, taken = InnerNodes.step, []
+
+    def interrupted(self, *args):
+        taken.append(args[-1])
+        if len(taken) == 25:
+            raise KeyboardInterrupt
+        return step(self, *args)
+
+    monkeypatch.setattr(InnerNodes, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        lod.build(given)
+    found = lod.build(given)
+    assert taken == [*range(1, 26), *range(21, 41)], "from step 20, the last that is kept"
+    for one, other in zip(expected.levels, found.levels, strict=True):
+        assert all(torch.equal(value, other.params[name]) for name, value in one.params.items())
+
+
+def test_a_state_of_other_points_is_not_gone_on_from(tmp_path, monkeypatch):
+    monkeypatch.setattr(hierarchy, "KEPT_EVERY", 2)
+    lod = Hierarchy(tile_points=50, steps=3)
+    lod.build(replace(lod_input(count=200), folder=tmp_path))
+    kept = tmp_path / "hierarchy.safetensors"
+    assert hierarchy.kept_state(kept, InnerNodes.of(merged_tree(lod_input(count=200).model, 50)).points).index == 2
+    assert hierarchy.kept_state(kept, InnerNodes.of(merged_tree(lod_input(count=300).model, 50)).points) is None
+    kept.write_bytes(b"no state")
+    assert hierarchy.kept_state(kept, InnerNodes.of(merged_tree(lod_input(count=200).model, 50)).points) is None
 
 
 def test_nodes_that_a_cut_does_not_show_rest():
