@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
+from listening import listening
 
 from surfkit.cli.recipes import chosen_recipe
 from surfkit.core import registry
+from surfkit.core.events import Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component, choice
 from surfkit.core.schedule import Interval, StepCount, Steps
@@ -38,6 +40,13 @@ def same_numbers():
     """What is drawn at random does not depend on the tests before."""
     if torch := sys.modules.get("torch"):
         torch.manual_seed(0)
+
+
+@pytest.fixture
+def warned():
+    """What warnings said."""
+    with listening(Warned, lambda event: event.text) as texts:
+        yield texts
 
 
 class Loss(Component):

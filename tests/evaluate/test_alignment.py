@@ -95,11 +95,11 @@ def test_noise_does_not_shrink():
     assert max(size) < 2e-3
 
 
-def test_a_loss_by_alignment_is_told(told):
+def test_a_loss_by_alignment_is_told(warned):
     ours, truth = town(7, count=1_000), town(0, count=1_000)
     outcome = compare(cloud(ours), cloud(truth), Comparison(crop="none", tau=4 * TAU, draws=1))
     before = outcome.others["none"]
     worse = comparison.replace(before, distances=comparison.replace(before.distances, to_truth=np.full(99, 9.0)))
-    assert not told
+    assert not warned
     warn_of_loss(worse, before, "similarity", 4 * TAU)
-    assert len(told) == 1 and "--align similarity lowers F1 from 0.9" in told[0] and "to 0.000" in told[0]
+    assert len(warned) == 1 and "--align similarity lowers F1 from 0.9" in warned[0] and "to 0.000" in warned[0]

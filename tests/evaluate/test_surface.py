@@ -68,7 +68,7 @@ def test_text_files(tmp_path):
     assert cloud.faces is None and cloud.vertices().tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, told):
+def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, warned):
     xyz = np.random.default_rng(0).normal(size=(1000, 3))
     xyz[[3, 700]] = np.nan
     write_points(tmp_path / "cloud.ply", xyz, np.zeros((1000, 3), np.uint8))
@@ -76,14 +76,14 @@ def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, told):
     blocks = list(read_surface(tmp_path / "cloud.ply").blocks())
     assert [len(block) for block in blocks] == [299, 300, 299, 100]
     assert np.array_equal(np.concatenate(blocks), xyz[np.isfinite(xyz).all(1)])
-    assert told == [f"{tmp_path / 'cloud.ply'}: 2 of 1000 points are not finite and are left out"]
+    assert warned == [f"{tmp_path / 'cloud.ply'}: 2 of 1000 points are not finite and are left out"]
 
 
-def test_faces_at_vertices_that_are_not_finite_go(tmp_path, told):
+def test_faces_at_vertices_that_are_not_finite_go(tmp_path, warned):
     vertices = BOX.vertices.copy()
     vertices[0] = np.inf
     found = read_surface(binary_ply(tmp_path / "mesh.ply", vertices, BOX.faces))
-    assert len(found.faces) == (BOX.faces != 0).all(1).sum() and len(told) == 1
+    assert len(found.faces) == (BOX.faces != 0).all(1).sum() and len(warned) == 1
 
 
 def cloud_with_lists(path, xyz, counted="uchar", first=(), cut=None):
@@ -211,15 +211,15 @@ PLACES = np.random.default_rng(0).uniform(0, 50, (2_000, 3)) + [500_000.0, 5_800
 
 
 @pytest.mark.parametrize("name", ["scan.las", "scan.laz", "SCAN.LAZ"])
-def test_laser_scans_are_clouds(tmp_path, name, told, monkeypatch):
+def test_laser_scans_are_clouds(tmp_path, name, warned, monkeypatch):
     scan(tmp_path / name, PLACES, "EPSG:32633")
     found = read_surface(tmp_path / name)
     assert found.faces is None and np.abs(found.vertices() - PLACES).max() < 1e-3
-    assert system_of(tmp_path / name) == "EPSG:32633" and not told
+    assert system_of(tmp_path / name) == "EPSG:32633" and not warned
     monkeypatch.setattr("surfkit.evaluate.geometry.las.CHUNK_POINTS", 300)
     xyz, rgb, _ = read_las(tmp_path / name, 900)
     assert np.abs(xyz - PLACES[::3]).max() < 1e-3 and rgb is None
-    assert len(told) == 1 and "667 of 2,000 points are used" in told[0]
+    assert len(warned) == 1 and "667 of 2,000 points are used" in warned[0]
 
 
 def test_a_file_that_is_no_scan_is_refused(tmp_path):
@@ -235,7 +235,7 @@ def test_a_file_that_is_no_scan_is_refused(tmp_path):
 @pytest.mark.filterwarnings("error::PendingDeprecationWarning:surfkit.evaluate.geometry.heights")
 @pytest.mark.parametrize("turned", [0.0, 0.5])
 @pytest.mark.parametrize("north_up", [True, False])
-def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, turned, told, monkeypatch):
+def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, turned, warned, monkeypatch):
     rasterio = needs("rasterio")
     rows, columns = np.indices((30, 40))
     heights = (100 + 0.5 * columns + 0.25 * rows).astype(np.float32)
@@ -258,7 +258,7 @@ def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, turned, told, monkeyp
     # Six of the triangles of half a cell each meet in the cell without a height.
     assert flat == pytest.approx(abs(np.linalg.det(axes)) * (29 * 39 - 6 / 2))
     monkeypatch.setattr("surfkit.evaluate.geometry.heights.MAX_CELLS", 300)
-    assert len(read_surface(tmp_path / "dsm.tif")) < 320 and "read as 20 x 15" in told[-1]
+    assert len(read_surface(tmp_path / "dsm.tif")) < 320 and "read as 20 x 15" in warned[-1]
 
 
 def test_pictures_and_rasters_without_a_place_are_refused(tmp_path):

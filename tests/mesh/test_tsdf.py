@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from listening import listening
 from needs import needs, needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.mesh import fusion, tsdf
 from surfkit.mesh import native_grid as native
 from surfkit.mesh.fusion_image import depth_of, picture
@@ -216,20 +215,8 @@ def test_blocks_are_counted_once_however_far_apart_they_are():
 
 
 def test_progress_is_told():
-    told = []
-
-    class Listener:
-        @hookimpl
-        def surfkit_event(self, event):
-            if isinstance(event, Progress):
-                told.append((event.what, event.done, event.total))
-
-    listener = Listener()
-    plugins().register(listener)
-    try:
+    with listening(Progress, lambda event: (event.what, event.done, event.total)) as told:
         TSDF(voxel=1.0).mesh(subject(around(5), sphere))
-    finally:
-        plugins().unregister(listener)
     assert [done for _, done, _ in told] == [1, 2, 3, 4, 5] and {total for *_, total in told} == {5}
     assert "voxels of 1 m" in told[0][0]
 

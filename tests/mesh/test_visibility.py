@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from listening import listening
 from needs import needs_native
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Progress, Warned
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
+from surfkit.core.events import Progress
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.closed import open_or_crowded
 from surfkit.mesh.delaunay import tetrahedralised
@@ -157,32 +156,17 @@ def test_the_number_of_threads_changes_nothing(ring):
     assert np.array_equal(again.vertices, ring.vertices) and np.array_equal(again.faces, ring.faces)
 
 
-class Listener:
-    def __init__(self):
-        self.told, self.done = [], set()
-
-    @hookimpl
-    def surfkit_event(self, event):
-        if isinstance(event, Warned):
-            self.told.append(event.text)
-        if isinstance(event, Progress):
-            self.done.add(event.what)
-
-
 def meshed_with(given, monkeypatch, halo):
+    """The mesh, and what was done for it."""
     monkeypatch.setattr("surfkit.mesh.visibility.HALO", halo)
-    listener = Listener()
-    plugins().register(listener)
-    try:
-        return PLAIN.mesh(given), listener
-    finally:
-        plugins().unregister(listener)
+    with listening(Progress, lambda event: event.what) as done:
+        return PLAIN.mesh(given), done
 
 
-def test_tiles_meet(ring, monkeypatch):
+def test_tiles_meet(ring, monkeypatch, warned):
     """With little memory the torus is cut in tiles: it is as good, and closed but for a crack or two."""
-    mesh, listener = meshed_with(subject(CAMERAS, torus, budget_bytes=8_000_000), monkeypatch, halo=10.0)
-    assert "voting, tile 4 of 4" in listener.done and not listener.told
+    mesh, done = meshed_with(subject(CAMERAS, torus, budget_bytes=8_000_000), monkeypatch, halo=10.0)
+    assert "voting, tile 4 of 4" in done and not warned
     share, crowded = boundary_share(mesh)
     assert share < 0.0005 and crowded == 0
     assert len(mesh.faces) == pytest.approx(len(ring.faces), rel=0.01)
@@ -209,10 +193,10 @@ def test_points_are_the_same_however_many_boxes_they_are_gathered_in():
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
 
 
-def test_too_little_memory_is_told(monkeypatch):
-    mesh, listener = meshed_with(subject(CAMERAS, torus, budget_bytes=1_000_000), monkeypatch, halo=100.0)
+def test_too_little_memory_is_told(monkeypatch, warned):
+    mesh, _ = meshed_with(subject(CAMERAS, torus, budget_bytes=1_000_000), monkeypatch, halo=100.0)
     assert open_or_crowded(mesh) == 0
-    assert [text for text in listener.told if "one tile needs about" in text]
+    assert [text for text in warned if "one tile needs about" in text]
 
 
 @pytest.mark.parametrize(

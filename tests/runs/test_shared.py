@@ -4,12 +4,11 @@ import json
 from dataclasses import fields, replace
 
 import pytest
+from listening import listening
 from two_blocks import EVERY, data, recipe, same, undisturbed
 
 from surfkit.compress.vectree import Vectree
 from surfkit.core.events import StageBegan
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.trim import Trim
 from surfkit.io.datasets.fingerprint import fingerprint
@@ -93,21 +92,13 @@ def test_inputs_count(data, recipe, tmp_path, monkeypatch):
     assert len({keys["pretrain"] for keys in (first, *others)}) == 6
 
 
-class Began(list):
-    """The stages that were begun, with the blocks."""
-
-    @hookimpl
-    def surfkit_event(self, event):
-        if isinstance(event, StageBegan):
-            self.append(event.stage if event.block is None else f"{event.stage} {event.block}")
-
-
 @pytest.fixture
 def began():
-    heard = Began()
-    plugins().register(heard, "began")
-    yield heard
-    plugins().unregister(heard)
+    """The stages that were begun, with the blocks."""
+    with listening(
+        StageBegan, lambda event: event.stage if event.block is None else f"{event.stage} {event.block}"
+    ) as stages:
+        yield stages
 
 
 def test_a_second_run_takes_what_the_first_has_made(data, recipe, undisturbed, tmp_path, began, capsys):

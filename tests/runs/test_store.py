@@ -4,9 +4,6 @@ import json
 
 import pytest
 
-from surfkit.core.events import Warned
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.runs import stage_cache as store_module
 from surfkit.runs.stage_cache import ENTRY_RECORD, StageCache
 
@@ -20,20 +17,6 @@ def run(tmp_path):
     (out / "events.jsonl").write_text("{}\n")
     (out / "pretrain" / "checkpoint.safetensors").write_bytes(b"state")
     return out
-
-
-@pytest.fixture
-def warnings():
-    class Heard(list):
-        @hookimpl
-        def surfkit_event(self, event):
-            if isinstance(event, Warned):
-                self.append(event.text)
-
-    heard = Heard()
-    plugins().register(heard, "heard")
-    yield heard
-    plugins().unregister(heard)
 
 
 def test_what_is_put_is_found_and_taken(run, tmp_path):
@@ -71,7 +54,7 @@ def test_files_are_copied_where_there_are_no_links(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", ["byte", "file", "record"])
-def test_a_damaged_entry_is_deleted_with_a_warning(run, tmp_path, warnings, damage):
+def test_a_damaged_entry_is_deleted_with_a_warning(run, tmp_path, warned, damage):
     store = StageCache(tmp_path / "stages")
     store.put("k1", run, NAMES)
     home = tmp_path / "stages" / "k1"
@@ -80,7 +63,7 @@ def test_a_damaged_entry_is_deleted_with_a_warning(run, tmp_path, warnings, dama
     else:
         (home / (NAMES[1] if damage == "file" else ENTRY_RECORD)).unlink()
     assert store.find("k1") is None and not home.exists()
-    assert len(warnings) == 1 and warnings[0].startswith("a stored stage is damaged and is computed again: ")
+    assert len(warned) == 1 and warned[0].startswith("a stored stage is damaged and is computed again: ")
 
 
 def test_what_a_dead_process_left_is_never_an_entry(run, tmp_path):

@@ -7,9 +7,6 @@ import pytest
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.scene import jpeg, photos
 from surfkit.scene import large_photos as large
 from surfkit.scene.photos import open_picture, read_draft, read_photo, refuse_large
@@ -161,23 +158,11 @@ def test_every_way_to_be_transparent_lies_over_black_or_white(tmp_path, kind):
         assert (got[:, :, :3] == 80).all() and (got[:, :, 3:] == (255 if white else 0)).all()
 
 
-class Heard:
-    def __init__(self):
-        self.texts = []
-
-    @hookimpl
-    def surfkit_event(self, event):
-        if isinstance(event, Warned):
-            self.texts.append(event.text)
-
-
 @pytest.fixture
-def heard(monkeypatch):
+def heard(monkeypatch, warned):
+    """Warnings, of which the first about JPEG files is told."""
     monkeypatch.setattr(jpeg, "_told", [False])
-    listener = Heard()
-    plugins().register(listener)
-    yield listener.texts
-    plugins().unregister(listener)
+    return warned
 
 
 def picture(width=200, height=152):

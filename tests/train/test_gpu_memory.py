@@ -6,9 +6,6 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
@@ -33,23 +30,6 @@ class Read(list):
     def __getitem__(self, at):
         self.read.append(at)
         return super().__getitem__(at)
-
-
-class Heard(list):
-    """The warnings of a run."""
-
-    @hookimpl
-    def surfkit_event(self, event):
-        if isinstance(event, Warned):
-            self.append(event.text)
-
-
-@pytest.fixture
-def heard():
-    found = Heard()
-    plugins().register(found)
-    yield found
-    plugins().unregister(found)
 
 
 @pytest.fixture
@@ -168,7 +148,7 @@ def test_on_a_cpu_nothing_is_kept_or_read_ahead(tiny):
 
 @pytest.mark.parametrize("within", [1, 30, 60])
 @pytest.mark.parametrize("step", [3, 6, 11])
-def test_a_step_is_repeated_where_memory_gives_out_once(there, heard, step, within):
+def test_a_step_is_repeated_where_memory_gives_out_once(there, warned, step, within):
     """Also where one that begins a new order, or an edit, does."""
     with simulated_gpu() as gpu:
         wanted = ends(*there(BIG))
@@ -182,4 +162,4 @@ def test_a_step_is_repeated_where_memory_gives_out_once(there, heard, step, with
         assert gpu.allocations > max(gpu.refused)
         assert trainer.uploads.bytes == 6 * 4 * 22 * 28, "once does not cost the photographs"
     assert_same(found, wanted)
-    assert heard == ["the memory of the GPU gave out; the step is repeated after torch has handed back its reserve"]
+    assert warned == ["the memory of the GPU gave out; the step is repeated after torch has handed back its reserve"]

@@ -3,12 +3,11 @@
 import mmap
 
 import pytest
+from listening import listening
 
 from surfkit.core import memory
 from surfkit.core.events import MemoryTaken
-from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import peak_memory_bytes, reset_peak_memory
-from surfkit.core.registry import plugins
 from surfkit.runs.run_notes import RunNotes
 from surfkit.train.memory_meter import MemoryMeter
 
@@ -21,21 +20,11 @@ def hold(count: int) -> None:
         held[:: mmap.PAGESIZE] = b"1" * -(-count // mmap.PAGESIZE)
 
 
-class Heard(list):
-    """The memory that was told of."""
-
-    @hookimpl
-    def surfkit_event(self, event):
-        if isinstance(event, MemoryTaken):
-            self.append(event)
-
-
 @pytest.fixture
 def heard():
-    found = Heard()
-    plugins().register(found)
-    yield found
-    plugins().unregister(found)
+    """The memory that was told of."""
+    with listening(MemoryTaken) as events:
+        yield events
 
 
 @pytest.fixture

@@ -123,13 +123,13 @@ def test_bounds_and_area_hold_both(tmp_path):
     assert record["covered"] == pytest.approx(1, abs=0.01)
 
 
-def test_volumes_that_the_area_cuts_off_are_told_and_those_outside_refused(tmp_path, heard):
+def test_volumes_that_the_area_cuts_off_are_told_and_those_outside_refused(tmp_path, warned):
     area = write_polygons(tmp_path / "site.gpkg", HOLED)
     inside = write_polygons(tmp_path / "inside.gpkg", box(3, 3, 5, 5))
     mapped(tmp_path / "maps", area, volume=inside)
-    assert "outside" not in " ".join(heard)
+    assert "outside" not in " ".join(warned)
     mapped(tmp_path / "maps", area, volume=write_polygons(tmp_path / "half.gpkg", box(4, 7, 8, 9)))
-    assert "50.0% of it, 4 m², lies outside the polygons of --area" in " ".join(heard)
+    assert "50.0% of it, 4 m², lies outside the polygons of --area" in " ".join(warned)
     with pytest.raises(BadInput, match="--volume: polygon 'a' lies outside the polygons of --area"):
         mapped(tmp_path / "none", area, volume=write_polygons(tmp_path / "hole.gpkg", box(7, 7, 9, 9)))
     assert not (tmp_path / "none").exists()
@@ -151,7 +151,7 @@ def test_areas_that_are_refused(tmp_path, shape, said):
     assert str(caught.value).startswith(f"--area {path}: polygon 1 ('a'): ") and not (tmp_path / "maps").exists()
 
 
-def test_a_folder_and_a_file_without_a_system(tmp_path, heard):
+def test_a_folder_and_a_file_without_a_system(tmp_path, warned):
     with pytest.raises(BadInput, match="^--area .*: it is a folder; name the GeoJSON, GPKG or SHP file"):
         mapped(tmp_path / "maps", tmp_path)
     local = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, None)
@@ -159,4 +159,4 @@ def test_a_folder_and_a_file_without_a_system(tmp_path, heard):
         mapped(tmp_path / "maps", write_polygons(tmp_path / "a.gpkg", TRIANGLE), frame=local, up="z")
     path = write_polygons(tmp_path / "b.shp", TRIANGLE, crs=None)
     assert mapped(tmp_path / "maps", path, frame=local, up="z")["area"]["area"] == pytest.approx(TRIANGLE.area)
-    assert "taken as those of the map" in " ".join(heard)
+    assert "taken as those of the map" in " ".join(warned)

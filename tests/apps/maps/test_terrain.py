@@ -139,7 +139,7 @@ def test_a_surface_that_is_all_roof_is_taken_for_ground(tmp_path):
 
 
 @pytest.mark.parametrize("depth", [0.3, 8.0])
-def test_a_surface_below_the_terrain_is_told(tmp_path, heard, depth):
+def test_a_surface_below_the_terrain_is_told(tmp_path, warned, depth):
     """Pits below trees, in 15 x 15 m of 1 % of the map; of the depth of noise they are ground."""
 
     def pits(x, y):
@@ -151,7 +151,7 @@ def test_a_surface_below_the_terrain_is_told(tmp_path, heard, depth):
     above = read(tmp_path / "ndsm.tif")
     share = float((above < -1).mean())
     assert abs(record["terrain"]["below_terrain"] - share) < 0.002
-    told = [each for each in heard if "below the terrain" in str(each)]
+    told = [each for each in warned if "below the terrain" in str(each)]
     assert (share > 0.005, len(told)) == ((True, 1) if depth > 1 else (False, 0))
 
 

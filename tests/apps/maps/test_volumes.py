@@ -223,12 +223,12 @@ def test_two_dates_and_the_least_detectable_difference(tmp_path):
     assert record["least_difference"] == 0.05 and record["unchanged"] == pytest.approx(400 - 4 * 10 - 8 * 7, rel=0.02)
 
 
-def test_what_has_no_surface_is_told_and_counts_as_nothing(tmp_path, heard):
+def test_what_has_no_surface_is_told_and_counts_as_nothing(tmp_path, warned):
     path = geojson(tmp_path / "a.geojson", [box((-2, 6), (2, 14))])
     found = measured(tmp_path, path, lambda x, y: 52 + 0 * x, base="lowest")[0]
     assert found["without_surface"] == pytest.approx(0.5, abs=0.01) and found["net"] == pytest.approx(0, abs=1e-3)
     assert found["outline_with_surface"] == pytest.approx(0.5, abs=0.01)
-    assert "has no surface" in " ".join(heard)
+    assert "has no surface" in " ".join(warned)
 
 
 def test_the_table_and_the_layer_say_what_the_record_says(tmp_path):
@@ -300,7 +300,7 @@ def test_degrees_swapped_are_noticed(tmp_path):
         measured(tmp_path, path, heap)
 
 
-def test_a_map_that_is_not_georeferenced_takes_files_without_a_system(tmp_path, heard):
+def test_a_map_that_is_not_georeferenced_takes_files_without_a_system(tmp_path, warned):
     frame = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, None)
     degrees = geojson(tmp_path / "a.geojson", [circle(5)], name="x")
     with pytest.raises(BadInput, match='WGS 84.*the map is not georeferenced.*"crs": null'):
@@ -308,4 +308,4 @@ def test_a_map_that_is_not_georeferenced_takes_files_without_a_system(tmp_path, 
     path = geojson(tmp_path / "b.geojson", [circle(5)], crs=None)
     found = measured(tmp_path, path, lambda x, y: 52 + 0 * x, frame=frame, base=50.0, up="z")[0]
     assert found["net"] == pytest.approx(2 * found["area"], rel=1e-6)
-    assert "taken as those of the map" in " ".join(heard)
+    assert "taken as those of the map" in " ".join(warned)

@@ -18,9 +18,6 @@ from surfkit.apps.render.path import flyover, from_file, lens_of, middle_of, orb
 from surfkit.apps.render.video import write_video
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import Warned
-from surfkit.core.hooks import hookimpl
-from surfkit.core.registry import plugins
 from surfkit.io.splats.cameras import write_cameras
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -189,22 +186,6 @@ class Drawing:
         self.drawn.append(float(camera.centre[0]))
         color = torch.full((3, camera.height, camera.width), float(camera.centre[0]) / 10)
         return Maps(color=color, alpha=color[0], depth=color[0] * 2, median=color[0] + 1)
-
-
-@pytest.fixture
-def warned():
-    found = []
-
-    class Heard:
-        @hookimpl
-        def surfkit_event(self, event):
-            if isinstance(event, Warned):
-                found.append(event.text)
-
-    listener = Heard()
-    plugins().register(listener)
-    yield found
-    plugins().unregister(listener)
 
 
 def test_frames_go_on_where_they_stopped(tmp_path, warned):
