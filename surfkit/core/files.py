@@ -104,6 +104,20 @@ def refuse_unwritable(folder: Path) -> None:
         raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(found))
 
 
+def where_now(path: Path, folder: Path, now: Path) -> Path | None:
+    """Where a path is that has moved together with a folder; None if it is still there, or has not.
+
+    Args:
+        path: That was, absolute.
+        folder: As it was then, absolute.
+        now: Where the folder is, absolute.
+    """
+    if folder == now or path.exists():
+        return None
+    found = Path(os.path.normpath(now / os.path.relpath(path, folder)))
+    return found if found.exists() else None
+
+
 def sync_folder(folder: Path) -> None:
     """Let the disk know the names in a folder, where the file system has a way to be asked."""
     with suppress(OSError):

@@ -13,6 +13,7 @@ from typing import Any
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import FileWritten, emit
+from surfkit.core.files import where_now
 from surfkit.io.datasets.data import Data
 from surfkit.primitives.base import Primitive
 from surfkit.runs import journal
@@ -331,14 +332,17 @@ def read_record(out: Path) -> dict[str, Any]:
 
 
 def read_data(out: Path) -> Data:
-    """The data that a run was made from."""
-    data = read_record(out).get("data")
+    """The data that a run was made from, also where they have moved together with its folder."""
+    record = read_record(out)
+    data, folder = record.get("data"), record.get("folder")
     if isinstance(data, dict) and isinstance(name := data.get("split"), str):
         data |= {"split": {"use": name}}  # of an older run: a split was a name
     try:
-        return load(Data, data, "data")
+        found = load(Data, data, "data")
     except BadInput as error:
         raise BadInput(f"{out / 'run.json'}: {error}") from error
+    there = where_now(found.path, Path(folder), out.resolve()) if isinstance(folder, str) else None
+    return found if there is None else found.moved(there)
 
 
 def _require_texts(path: Path, name: str, value: Any) -> None:

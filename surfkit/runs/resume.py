@@ -265,6 +265,7 @@ def write_run_files(
             "threads": torch.get_num_threads(),
             "seed": run.recipe.seed,
             "data": run.data,
+            "folder": str(run.out.resolve()),
             "prepare_cpu_seconds": depth_maps_cpu_seconds(run, before),
             "frame": {
                 "origin": frame.origin.tolist(),

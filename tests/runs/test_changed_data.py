@@ -42,10 +42,15 @@ def source(tmp_path_factory):
 def trained(source, tmp_path):
     """A run of one's own, and a data set of one's own, as if it had been trained on that."""
     shutil.copytree(source, tmp_path, dirs_exist_ok=True)
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
-    record["data"]["path"] = str(tmp_path / "data")
-    (tmp_path / "run" / "run.json").write_text(json.dumps(record))
+    write_record(tmp_path / "run", data={"path": str(tmp_path / "data")})
     return tmp_path / "run", tmp_path / "data"
+
+
+def write_record(out, data=None, **facts):
+    """Change what run.json says."""
+    record = json.loads((out / "run.json").read_text())
+    record |= facts | {"data": record["data"] | (data or {})}
+    (out / "run.json").write_text(json.dumps(record))
 
 
 def rewritten(path, change):
@@ -154,6 +159,40 @@ def test_the_same_content_is_no_change(trained, capsys):
     assert main(["export", str(out)]) == 2
     (out / "inputs.json").unlink()
     assert main(["export", str(out)]) == 0
+
+
+def test_a_run_and_its_data_that_move_together_stay_a_run(trained, tmp_path, capsys):
+    out, data = trained
+    write_record(out, folder=str(out), data={"masks": str(data / "masks")})
+    there = tmp_path / "elsewhere"
+    there.mkdir()
+    for each in (out, data):
+        shutil.move(each, there / each.name)
+    found = opened(there / "run").data
+    assert (found.path, found.masks) == (there / "data", there / "data/masks")
+    write_record(there / "run", data={"masks": None})
+    assert main(["mesh", str(there / "run")]) == 0
+    places = ["--data", str(there / "data"), "--out", str(there / "run")]
+    assert main(["train", *WORDS, *places]) == 0, capsys.readouterr().err
+    assert json.loads((there / "run/run.json").read_text())["data"]["path"] == str(there / "data")
+
+
+def test_other_data_in_that_place_are_refused(trained, tmp_path, capsys):
+    out, data = trained
+    write_record(out, folder=str(out))
+    (tmp_path / "elsewhere").mkdir()
+    for each in (out, data):
+        shutil.move(each, tmp_path / "elsewhere" / each.name)
+    photographs(tmp_path / "elsewhere/data")
+    assert main(["mesh", str(tmp_path / "elsewhere/run")]) == 2
+    assert "have changed since the run was trained" in capsys.readouterr().err
+
+
+def test_data_that_moved_alone_are_not_found(trained, tmp_path, capsys):
+    out, data = trained
+    write_record(out, folder=str(out))
+    shutil.move(data, tmp_path / "moved")
+    assert main(["mesh", str(out)]) == 2 and "is not there; put it back" in capsys.readouterr().err
 
 
 def test_another_version_may_have_read_it_otherwise(trained):

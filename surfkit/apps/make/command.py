@@ -19,6 +19,7 @@ from surfkit.apps.prepare_photos import refuse_overlap
 from surfkit.cli.recipes import ARGV
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
+from surfkit.core.files import where_now
 from surfkit.core.lock import locked
 from surfkit.core.version import own_version
 from surfkit.io.datasets.data import ReadSettings
@@ -121,10 +122,13 @@ class MakeCommand:
         """
         source = str(self.source.resolve())
         versions = {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__}
-        now = MakeRecord(source, self.quality, dump(reading), versions=versions)
+        folder = str(self.out.resolve())
+        now = MakeRecord(source, self.quality, dump(reading), versions=versions, folder=folder)
         before = read_record(self.out)
         if before is None:
             return Delivery(self.out, now, self.given)
+        if before.folder and where_now(Path(before.input), Path(before.folder), self.out.resolve()) == Path(source):
+            before.input = source
         remedy = f"give the same again, or name another folder, or delete {self.out}"
         if before.input != now.input:
             raise BadInput(f"--out {self.out} was made of {before.input}, and this is {now.input}; {remedy}")
@@ -140,7 +144,7 @@ class MakeCommand:
                     f"--out {self.out} was made with {flag} {before.reading.get(name)}, and this is {flag} {value}; "
                     f"{remedy}"
                 )
-        before.versions = versions
+        before.versions, before.folder = versions, folder
         if before.decisions is not None and self.steps is not None:
             if self.steps < before.decisions.steps and (self.out / "run" / "run.json").exists():
                 raise BadInput(

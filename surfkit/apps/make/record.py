@@ -85,6 +85,7 @@ class MakeRecord:
         steps: By name, in their order.
         files: What a client opens, by what it is; inside the delivery.
         versions: Of surfkit and of what it runs on.
+        folder: Of the delivery: what has moved with it is found again.
     """
 
     input: str
@@ -95,6 +96,7 @@ class MakeRecord:
     steps: dict[str, FinishedStep] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
+    folder: str = ""
 
 
 class Delivery:

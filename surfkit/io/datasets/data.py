@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -140,6 +140,12 @@ class Data(ReadSettings):
 
     priors: Annotated[Path | None, tyro.conf.Suppress] = None
     """Folder of the depth maps that a run made for it, where it has none of its own."""
+
+    def moved(self, path: Path) -> Data:
+        """The same data set, which is at `path` now, with all that lies in it."""
+        paths = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "path"}
+        inside = {n: p for n, p in paths.items() if isinstance(p, Path) and p.is_relative_to(self.path)}
+        return replace(self, path=path, **{name: path / it.relative_to(self.path) for name, it in inside.items()})
 
     def held_out(self, capture: RawDataset) -> set[str]:
         """Names of the photographs that are held out: not trained on, kept to measure with.

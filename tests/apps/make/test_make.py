@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sys
 from dataclasses import replace
 
@@ -148,6 +149,21 @@ def test_without_depth_maps_the_precision_is_left_out(farm, unmeasured, monkeypa
     assert set(record(farm)["left_out"]) == {"precision"}
     drawn = farm.parent / "delivery/maps"
     assert (drawn / "dsm.tif").exists() and not (drawn / "precision.tif").exists()
+
+
+@needs_native
+def test_a_delivery_that_has_moved_with_its_data_goes_on(farm, unmeasured, monkeypatch, capsys):
+    needs("fast_simplification"), needs("rasterio")
+    assert make(farm) == 0
+    there = farm.parent / "there"
+    there.mkdir()
+    for each in (farm, farm.parent / "delivery"):
+        shutil.move(each, there / each.name)
+    seen = calls(monkeypatch)
+    assert make(there / "farm") == 0 and seen == []
+    assert record(there / "farm")["input"] == str(there / "farm")
+    shutil.copytree(there / "farm", there / "farm2")
+    assert make(there / "farm2") == 2 and "was made of" in capsys.readouterr().err
 
 
 @needs_native
