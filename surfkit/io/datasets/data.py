@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -143,9 +143,13 @@ class Data(ReadSettings):
 
     def moved(self, path: Path) -> Data:
         """The same data set, which is at `path` now, with all that lies in it."""
-        paths = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "path"}
-        inside = {n: p for n, p in paths.items() if isinstance(p, Path) and p.is_relative_to(self.path)}
-        return replace(self, path=path, **{name: path / it.relative_to(self.path) for name, it in inside.items()})
+        named = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "path"}
+        inside: dict[str, Any] = {
+            name: path / it.relative_to(self.path)
+            for name, it in named.items()
+            if isinstance(it, Path) and it.is_relative_to(self.path)
+        }
+        return replace(self, path=path, **inside)
 
     def held_out(self, capture: RawDataset) -> set[str]:
         """Names of the photographs that are held out: not trained on, kept to measure with.
