@@ -120,8 +120,9 @@ def optimise_divided(job: StageJob, state: StageState | None, count: int, caches
         checkpoint.save(at.checkpoint, fresh())
     else:
         say(f"{at.out}: going on after step {state.index} of {at.stage.steps}")
-    if count > (cores := os.cpu_count() or 1):
-        emit(Warned(f"--processes {count}: this machine has {cores} cores, so they wait for each other; give less"))
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if count > cores:
+        emit(Warned(f"--processes {count}: there are {cores} cores for them, so they wait for each other; give less"))
     budget = replace(caches, cache=f"{max(1, caches.bytes() // count // 1_000_000)}MB")
     threads = max(1, torch.get_num_threads() // count)
     while True:

@@ -8,6 +8,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.runs.folder import Run
 from surfkit.scene.scene import Scene
+from surfkit.train.smaller import MIN_SIDE_PX
 from surfkit.train.state import StageState
 
 NONE_HELD_OUT = (
@@ -33,6 +34,23 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
                 epochs = f" of {views:,} photographs to an epoch" * (views > 1)
                 due = f"is never due within its {stage.steps:,} steps{epochs}; more steps, or another schedule of it,"
                 emit(Warned(f"{at.setting}.prune.{number}: {name_of(prune)} {due} change that"))
+
+
+def warn_of_sizes(run: Run, scene: Scene) -> None:
+    """Say where a schedule of small photographs does nothing."""
+    for at in run.stages:
+        quarter, half = at.stage.quarter_until, at.stage.half_until
+        largest = max((min(view.camera.width, view.camera.height) for view in scene.train), default=0)
+        if 0 < half <= quarter:
+            text = f"half_until {half} does nothing, as photographs have a quarter of their size up to step {quarter}"
+            emit(Warned(f"{at.setting}.{text}"))
+        if (quarter or half) and largest < 2 * MIN_SIDE_PX:
+            emit(
+                Warned(
+                    f"{at.setting}: photographs keep their size in all steps, as {largest} px are too few to halve "
+                    f"(the shorter side stays at {MIN_SIDE_PX} px or more)"
+                )
+            )
 
 
 def warn_of_gaps(scene: Scene, state: StageState | None) -> None:

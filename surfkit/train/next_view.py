@@ -10,6 +10,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
 from surfkit.losses.base import Neighbour, Target
 from surfkit.raster.api import Maps, Splats
+from surfkit.train.divide import refuse_apart
 from surfkit.train.setup import StageSetup
 from surfkit.train.smaller import smaller
 from surfkit.train.state import StageState
@@ -60,6 +61,8 @@ def neighbour(setup: StageSetup, state: StageState, splats: Splats, shown: int, 
     for at in (*found[first:], *found[:first]):
         if at in state.skipped or (second := _readable(setup, state, at, setup.uploads.aside(at))) is None:
             continue
+        if setup.processes is not None:
+            refuse_apart(setup.processes, at, state.skipped)
         whole = Target(setup.views[at], second.in_floats(), mask=second.mask)
         other = smaller(whole, setup.stage.divisor_at(state.index + 1))
         drawn = setup.draws.render(splats, other.view.camera, setup.stage.near, True, False).maps

@@ -15,6 +15,8 @@ from surfkit.scene.camera import Camera
 
 MIN_SIDE_PX = 32
 """No photograph is made smaller than this on its shorter side: windows of losses would cover most of it."""
+MIN_MASK_SHARE = 0.75
+"""Share of the pixels of a block that count, from which the block does."""
 MAX_DEPTH_SPREAD = 0.05
 """Largest difference of inverse depths in a block, as a share of their mean; beyond it the block is at an edge."""
 
@@ -35,15 +37,21 @@ def smaller_camera(camera: Camera, divisor: int) -> Camera:
 def smaller(target: Target, divisor: int) -> Target:
     """The target with blocks of `divisor` x `divisor` pixels as pixels. It has no second view yet.
 
-    A block has the mean colour; it counts where the mask is True in all of it.
+    A block has the mean colour of its pixels that count, and counts where MIN_MASK_SHARE of them do.
     """
     if (divisor := divisor_for(target.view.camera, divisor)) == 1:
         return target
+    photo, mask = avg_pool2d(target.photo, divisor), None
+    if target.mask is not None:
+        keep = target.mask.to(target.photo)[None]
+        share = avg_pool2d(keep, divisor)
+        photo = torch.where(share > 0, avg_pool2d(target.photo * keep, divisor) / share, photo)
+        mask = share[0] >= MIN_MASK_SHARE
     return replace(
         target,
         view=replace(target.view, camera=smaller_camera(target.view.camera, divisor)),
-        photo=avg_pool2d(target.photo, divisor),
-        mask=None if target.mask is None else every(target.mask, divisor),
+        photo=photo,
+        mask=mask,
         prior=None if target.prior is None else smaller_prior(target.prior, divisor),
     )
 

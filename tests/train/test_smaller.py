@@ -8,14 +8,18 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.losses import L1, SSIM, Reprojection
 from surfkit.losses.base import Target
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
+from surfkit.runs.folder import Run
+from surfkit.runs.warn import warn_of_sizes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View
+from surfkit.study.recipes import RECIPES
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
 from surfkit.train.smaller import divisor_for, smaller, smaller_camera
@@ -75,14 +79,25 @@ def test_nothing_is_known_of_a_block_at_an_edge_or_with_a_pixel_of_which_nothing
         assert torch.equal(smaller(target(inverse), divisor).prior.confidence > 0, expected)
 
 
-def test_a_block_counts_if_the_mask_leaves_it_whole_and_normals_stay_of_length_one():
+def test_a_block_counts_with_the_colour_of_three_quarters_of_its_pixels():
     mask = torch.ones(130, 143, dtype=torch.bool)
-    mask[7, 9] = False
+    mask[4:6, 8:10], mask[4:6, 12:14], mask[6, 12] = False, False, False  # 12 and 11 of 16 are left
+    given = target(mask=mask)
+    small = smaller(given, 4)
+    assert (~small.mask).nonzero().tolist() == [[1, 3]]
+    for column in (2, 3):
+        columns = slice(4 * column, 4 * column + 4)
+        inside = given.photo.numpy()[:, 4:8, columns][:, mask[4:8, columns].numpy()]
+        assert np.allclose(small.photo[:, 1, column].numpy(), inside.mean(1), atol=1e-6)
+    none = smaller(target(mask=torch.zeros_like(mask)), 4)
+    assert not none.mask.any() and torch.isfinite(none.photo).all()
+
+
+def test_normals_stay_of_length_one():
     normal = torch.nn.functional.normalize(torch.randn(3, 130, 143, generator=torch.Generator().manual_seed(2)), dim=0)
     normal[:, 21, 33] = 0
-    given = target(plane(), mask=mask)
+    given = target(plane())
     small = smaller(replace(given, prior=replace(given.prior, normal=normal)), 4)
-    assert (~small.mask).nonzero().tolist() == [[1, 2]]
     lengths = small.prior.normal.norm(dim=0)
     assert (lengths == 0).nonzero().tolist() == [[5, 8]] and torch.allclose(lengths[lengths > 0], torch.tensor(1.0))
     mean = normal[:, 4:8, 12:16].mean((1, 2))
@@ -129,6 +144,22 @@ def test_steps_have_the_sizes_of_the_schedule_and_a_run_that_goes_on_has_the_sam
     checkpoint.save(tmp_path / "state.safetensors", halfway)
     again = checkpoint.load(tmp_path / "state.safetensors")
     assert [done.losses for done in other.run(again)] == [done.losses for done in whole[2:]]
+
+
+@pytest.mark.parametrize(
+    ("quarter", "half", "size", "text"),
+    [
+        (4, 0, (64, 48), "48 px are too few to halve"),
+        (4, 2, (128, 96), "pretrain.half_until 2 does nothing"),
+        (2, 4, (128, 96), None),
+        (0, 0, (64, 48), None),
+    ],
+)
+def test_a_schedule_that_does_nothing_is_told(warned, tmp_path, quarter, half, size, text):
+    scene = photograph(Flight(views=2, width=size[0], height=size[1], test_every=0)).scene
+    recipe = replace(RECIPES["2dgs"], pretrain=Stage(steps=8, quarter_until=quarter, half_until=half))
+    warn_of_sizes(Run(tmp_path, recipe, Data(tmp_path)), scene)
+    assert len(warned) == (text is not None) and all(text in each for each in warned)
 
 
 def test_a_negative_number_of_steps_is_refused():

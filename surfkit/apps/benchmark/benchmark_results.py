@@ -18,7 +18,7 @@ import torch
 from surfkit.apps.benchmark.protocol import MEAN, BenchmarkScene, Contender, Protocol
 from surfkit.apps.benchmark.provenance import Provenance, commit
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, write_json, write_text
+from surfkit.core.codec import dump, read_json, read_keys, write_json, write_text
 from surfkit.core.version import own_version
 from surfkit.study.metric_columns import TABLE_COLUMNS
 
@@ -27,6 +27,24 @@ RESULTS_FILE = "benchmark.json"
 """In the folder of a benchmark: all of its results."""
 PARTS = ("surfkit", "commit", "torch", "device", "data")
 """Of the provenance of a run, those that are shown."""
+
+
+def results_in(out: Path, protocol: Protocol) -> dict[str, Any] | None:
+    """The results of a protocol that a folder has; None if it has none.
+
+    Raises:
+        BadInput: They are of another protocol, or of another declaration of this one, or no results.
+    """
+    path, remedy = out / RESULTS_FILE, "name another folder, or delete that one"
+    if not path.exists():
+        return None
+    hints = {"benchmark": str, "protocol": dict[str, Any], "data": dict[str, Any], "versions": dict[str, Any]}
+    known = read_keys(path, hints, remedy)
+    if known["benchmark"] != protocol.tag:
+        raise BadInput(f"--out {out} has results of {known['benchmark']}, and this is {protocol.tag}; {remedy}")
+    if known["protocol"].get("digest") != protocol.digest:
+        raise BadInput(f"--out {out} has results of {protocol.tag} by another declaration of that version; {remedy}")
+    return read_json(path, dict[str, Any])
 
 
 def report_of(
@@ -88,7 +106,7 @@ def still_valid(
     protocol: Protocol, before: Mapping[str, Any] | None, rows: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """Rows of an earlier command that are not among those of now, and that the same command would not train again."""
-    if before is None or before["protocol"]["digest"] != protocol.digest:
+    if before is None:
         return []
     now, known = {(row["scene"], row["recipe"]) for row in rows}, {scene.name: scene for scene in protocol.scenes}
     kept = []

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.apps.benchmark.benchmark_results import LEGEND, RESULTS_FILE, facts, failures, head_and_cells
+from surfkit.apps.benchmark.benchmark_results import LEGEND, facts, failures, head_and_cells, results_in
 from surfkit.apps.benchmark.folder_check import look
 from surfkit.apps.benchmark.protocol import Protocol
 from surfkit.apps.benchmark.protocol_words import description
@@ -16,7 +16,6 @@ from surfkit.apps.benchmark.protocols import PROTOCOLS, protocol_of
 from surfkit.apps.benchmark.run_benchmark import BenchmarkPlan, run
 from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput, printable
-from surfkit.core.codec import read_json
 from surfkit.core.events import say
 from surfkit.raster.select import Device
 from surfkit.study.ablation_screen import AblationScreen
@@ -82,9 +81,9 @@ class BenchmarkCommand:
         out = self.out or Path("runs") / protocol.tag
         if self.show:
             self._refuse_unread(BenchmarkCommand(self.name, self.root, show=True, out=self.out))
-            if not (out / RESULTS_FILE).exists():
+            if (found := results_in(out, protocol)) is None:
                 raise BadInput(f"--out {out}: no results of a benchmark in it; name their folder")
-            return show(read_json(out / RESULTS_FILE, dict[str, Any]))
+            return show(found)
         if self.root is None:
             raise BadInput(
                 f"--root missing: the folder of the data; `surfkit benchmark {self.name} --describe` shows it"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def data_hash(scene: Scene, files: Sequence[Path], root: Path, out: Path) -> str
         before = read_json(path, Fingerprint) if path.exists() else None
     except BadInput:  # of another version: everything is read again
         before = None
-    whole = [each for file in files for each in (sorted(_pictures(file)) if file.is_dir() else [file])]
+    whole = [each for file in files for each in (pictures_in(file) if file.is_dir() else [file])]
     now = fingerprint(scene, before, None, whole)
     now = Fingerprint(now.points, now.photographs, now.beside, {str(file): now.files[str(file)] for file in whole})
     write_json(path, now)
@@ -52,5 +53,12 @@ def _timeless(stamp: dict[str, object]) -> dict[str, object]:
     return {name: it for name, it in stamp.items() if name != "time_ns"}
 
 
-def _pictures(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES]
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures in a folder and in those inside, links among them, in the order of their paths."""
+    found: list[Path] = []
+    been: set[str] = set()
+    for here, inner, names in os.walk(folder, followlinks=True):
+        been.add(os.path.realpath(here))
+        inner[:] = [name for name in inner if os.path.realpath(os.path.join(here, name)) not in been]
+        found += [Path(here, name) for name in names if Path(name).suffix.lower() in PICTURE_SUFFIXES]
+    return sorted(path for path in found if not path.name.startswith("._"))  # what macOS writes beside files

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from surfkit.apps.benchmark.data_record import pictures_in
 from surfkit.apps.benchmark.protocol import BenchmarkScene, Contender, Protocol
 from surfkit.apps.benchmark.truths import Count, Needed
 from surfkit.core.check import BadInput, collecting, few
@@ -19,10 +20,13 @@ from surfkit.io.datasets.depth_prior import prior_files
 from surfkit.io.datasets.read import read
 from surfkit.runs.folder import Run
 from surfkit.runs.recipe import complete
-from surfkit.scene.photo_names import PICTURE_SUFFIXES
+from surfkit.scene.jpeg import EOI_MARKER
 from surfkit.scene.photos import photo_size
 from surfkit.scene.scene import Scene
 from surfkit.study.perceptual import refuse_unmeasurable
+
+TAIL_BYTES = 1 << 16
+"""Of a picture, in which its end must be."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ def _of_pictures(folder: Path, needed: Needed) -> Iterator[str]:
     if not folder.is_dir():
         yield "a file, where there must be a folder"
         return
-    pictures = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
+    pictures = pictures_in(folder)
     if text := _wrong(len(pictures), needed.pictures, "pictures"):
         yield text
     small, damaged = [], []
@@ -127,12 +131,22 @@ def _of_pictures(folder: Path, needed: Needed) -> Iterator[str]:
         try:
             if max(photo_size(path)) < (needed.longest or 0):
                 small.append(path.name)
+            if not has_end(path):
+                damaged.append(path.name)
         except BadInput:
             damaged.append(path.name)
     if small:
         yield f"smaller than {needed.longest} px: {len(small)} of {len(pictures)}, {few(small)}"
     if damaged:
-        yield f"cannot be read: {len(damaged)} of {len(pictures)}, {few(damaged)}"
+        yield f"cannot be read, or end too early: {len(damaged)} of {len(pictures)}, {few(damaged)}"
+
+
+def has_end(path: Path) -> bool:
+    """Whether a PNG or JPEG file has its end; others are not looked at. What cameras write behind it may follow."""
+    end = {".png": b"IEND", ".jpg": EOI_MARKER, ".jpeg": EOI_MARKER}.get(path.suffix.lower())
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        return end is None or end in file.read()
 
 
 def _wrong(count: int, wanted: Count | None, what: str) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from surfkit.apps.benchmark.benchmark_results import RESULTS_FILE, report_of, write_report
+from surfkit.apps.benchmark.benchmark_results import report_of, results_in, write_report
 from surfkit.apps.benchmark.data_record import data_hash
 from surfkit.apps.benchmark.protocol import BenchmarkScene, Contender, Protocol
 from surfkit.apps.benchmark.provenance import PROVENANCE_FILE, Provenance, provenance_now
@@ -128,9 +128,8 @@ def opened(plan: BenchmarkPlan, watch: AblationWatcher | None = None) -> Keeper:
     Raises:
         BadInput: Data that cannot be used, or results that were made from other data or by another protocol.
     """
-    path, results = plan.out / PROVENANCE_FILE, plan.out / RESULTS_FILE
+    path, before = plan.out / PROVENANCE_FILE, results_in(plan.out, plan.protocol)
     made = read_json(path, dict[str, Provenance]) if path.exists() else {}
-    before = read_json(results, dict[str, Any]) if results.exists() else None
     tables = []
     for scene in plan.scenes:
         out, read_scene = plan.out / scene.name, read(scene.data(plan.root))

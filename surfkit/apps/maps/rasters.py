@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +39,8 @@ BANDS = {
     "orthophoto-photographs.tif": ("number of the photograph", False),
 }
 """What the band of a file has, and whether it is a length in the unit of the map."""
+LOCAL_UNIT = re.compile(r'^LOCAL_CS\[.*UNIT\["([^"]+)"', re.DOTALL)
+"""Of a local system without a reference; "unit" is one of unknown or odd length."""
 FACTS_TAG = "surfkit"
 """Tag of a tile for what was counted when it was drawn."""
 
@@ -156,7 +159,8 @@ def length_unit(crs: Any) -> str | None:
     alone."""
     if crs.linear_units != "unknown":
         return str(crs.linear_units)
-    return "metre" if 'UNIT["metre"' in crs.to_wkt() else None
+    found = LOCAL_UNIT.search(crs.to_wkt())
+    return found[1] if found and found[1] != "unit" else None
 
 
 def window_of(window: Window) -> Any:

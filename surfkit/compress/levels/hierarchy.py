@@ -109,7 +109,9 @@ class Hierarchy(LevelsOfDetail):
             return tree
         finally:
             pictures.close()
-        return SplatTree(tree.order, inner.levels(), tree.blocks)
+        known = tree.blocks  # whose splats may reach farther now
+        rows = (each.tolist() for each in (known.level, known.first, known.last, known.parent, known.error))
+        return SplatTree.of(tree.order, inner.levels(), [LodBlock(*row) for row in zip(*rows, strict=True)])
 
 
 def kept_state(path: Path, like: Points) -> StageState | None:

@@ -11,7 +11,7 @@ import torch
 
 from surfkit.apps.benchmark import protocols
 from surfkit.apps.benchmark.benchmark_results import head_and_cells, report_of
-from surfkit.apps.benchmark.data_record import data_hash
+from surfkit.apps.benchmark.data_record import data_hash, pictures_in
 from surfkit.apps.benchmark.protocols import PROTOCOLS
 from surfkit.cli import main
 from surfkit.io.datasets import fingerprint
@@ -110,6 +110,8 @@ def test_what_is_not_as_it_should_be(root, tiny, tmp_path, capsys, monkeypatch):
     folder = copy(root, tmp_path / "data")
     (folder / "A/images/view_001.png").unlink()
     (folder / "A/images/view_002.png").write_bytes(b"no picture")
+    cut = folder / "A/images/view_003.png"
+    cut.write_bytes(cut.read_bytes()[:-20])
     (folder / "ground_truth/A.ply").write_text("ply\nno cloud")
     lines = (folder / "ground_truth/B.ply").read_text().splitlines()
     lines[2] = "element vertex 20"
@@ -122,7 +124,7 @@ def test_what_is_not_as_it_should_be(root, tiny, tmp_path, capsys, monkeypatch):
     assert tiny_run(folder, tmp_path / "out", "--check") == 2
     said = capsys.readouterr().err
     assert "8 pictures, where there must be 9; it is the photographs, from the page of photographs, https://" in said
-    assert "cannot be read: 1 of 8, 'view_002.png'" in said
+    assert "cannot be read, or end too early: 2 of 8, 'view_002.png', 'view_003.png'" in said
     assert f"{folder}/ground_truth/A.ply: cannot be used: " in said
     assert "20 points, where there must be 100 or more; it is the laser scan, from the page of scans" in said
     assert "6 training photographs, where there must be 7" in said
@@ -209,6 +211,35 @@ def test_another_declaration_of_the_same_version_is_refused(done, tiny, root, no
     assert tiny_run(root, done) == 2
     assert "by another declaration of that version" in capsys.readouterr().err
     assert not no_training
+
+
+@pytest.mark.parametrize("show", [True, False])
+def test_results_of_another_benchmark_stay(done, tiny, root, no_training, tmp_path, monkeypatch, capsys, show):
+    out = copy(done, tmp_path / "out")
+    before = (out / "benchmark.json").read_bytes()
+    monkeypatch.setitem(protocols.PROTOCOLS, "tiny", replace(tiny, version=2))
+    assert (main(["benchmark", "tiny", "--show", "--out", str(out)]) if show else tiny_run(root, out)) == 2
+    assert "has results of tiny-1, and this is tiny-2; name another folder" in capsys.readouterr().err
+    assert (out / "benchmark.json").read_bytes() == before and not no_training
+
+
+def test_a_file_that_holds_no_results_is_one_line(tiny, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(protocols.PROTOCOLS, "tiny", tiny)
+    (tmp_path / "benchmark.json").write_text('{"a": 1}')
+    assert main(["benchmark", "tiny", "--show", "--out", str(tmp_path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_pictures_in_folders_that_are_links_count(tmp_path):
+    """Each once, also where links lead round in a circle; not what macOS writes beside files."""
+    (tmp_path / "real/inner").mkdir(parents=True)
+    (tmp_path / "images").mkdir()
+    for name in ("real/a.jpg", "real/._a.jpg", "real/inner/b.png", "real/c.txt", "images/d.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "images/linked").symlink_to(tmp_path / "real")
+    (tmp_path / "real/inner/up").symlink_to(tmp_path / "images")
+    names = [path.relative_to(tmp_path / "images").as_posix() for path in pictures_in(tmp_path / "images")]
+    assert names == ["d.jpg", "linked/a.jpg", "linked/inner/b.png"]
 
 
 def test_the_hash_is_of_what_is_read(root, tiny, tmp_path, monkeypatch):

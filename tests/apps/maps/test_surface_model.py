@@ -119,6 +119,7 @@ def test_geotiffs_are_read_back(surface, tmp_path):
         ("EPSG:32633", 1.0, "metre"),
         ("EPSG:2263", 0.3048006096012192, "US survey foot"),
         (None, 1.0, "metre"),
+        (None, 0.3048, None),
         (None, None, None),
     ],
 )

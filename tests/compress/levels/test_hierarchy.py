@@ -13,7 +13,7 @@ from surfkit.compress.levels.moments import Shapes
 from surfkit.compress.levels.splat_tree import AXIS_TURNS, TURNED_AXES, Cut, leaf_ends, level_sizes, turned
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import ALPHA_MAX
+from surfkit.raster.api import ALPHA_MAX, CUTOFF
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints
@@ -245,6 +245,9 @@ def test_optimisation_lowers_the_loss_at_every_granularity_and_leaves_the_leaves
         assert all(
             torch.equal(a.params[name], b.params[name]) for a, b in zip(plain.levels, taught.levels, strict=True)
         )
+    for at in range(len(taught.blocks)):
+        level, rows = taught.levels[taught.blocks.level[at]], slice(taught.blocks.first[at], taught.blocks.last[at])
+        assert CUTOFF * float(level.take(rows).splats.scales.max()) <= taught.blocks.reach[at] * (1 + 1e-6)
     wanted = [drawn(given.model.splats, view.camera) for view in given.views]
     for granularity in (0.2, 0.3, 0.4, 0.6, 0.8):
         loss = []
