@@ -145,8 +145,9 @@ def estimate(
     assert probed.started is not None and probed.written is not None
     counts = np.array([taken.points for taken in probed.taken], float)
     peaks = np.array([taken.peak_bytes for taken in probed.taken], float)
-    point_bytes = max(slope(counts, peaks), 2.5 * probed.written.checkpoint_bytes)
-    per_point = max(0.0, slope(counts, np.array([taken.seconds for taken in probed.taken])))
+    sizes = np.array([taken.divisor for taken in probed.taken])
+    point_bytes = max(slope(counts, peaks, sizes), 2.5 * probed.written.checkpoint_bytes)
+    per_point = max(0.0, slope(counts, np.array([taken.seconds for taken in probed.taken]), sizes))
     step_seconds = tuple(
         taken.seconds + per_point * (part.points - taken.points)
         for part, taken in zip(parts, probed.taken, strict=True)
@@ -179,19 +180,24 @@ def estimate(
 
 
 def _on_gpu(load: FixedCosts, rising: Growth, probed: ProbeResult, free: int) -> GpuEstimate:
-    counts, peaks = (
-        np.array(each, float) for each in zip(*((t.points, t.gpu_bytes) for t in probed.taken), strict=True)
+    counts, peaks, sizes = (
+        np.array(each, float) for each in zip(*((t.points, t.gpu_bytes, t.divisor) for t in probed.taken), strict=True)
     )
-    each = max(0.0, slope(counts, peaks))
+    each = max(0.0, slope(counts, peaks, sizes))
     held = int(peaks.max() + each * max(0, rising.last - counts.max()))
     cached = min(load.view_bytes, int(GPU_SHARE * free))
     return GpuEstimate(held + cached, cached, each, free)
 
 
-def slope(x: np.ndarray, y: np.ndarray) -> float:
-    """How fast y rises with x, by least squares; 0 where x does not vary."""
-    centred = x - x.mean()
-    return float((centred * y).sum() / (centred**2).sum()) if np.ptp(x) > 0 else 0.0
+def slope(x: np.ndarray, y: np.ndarray, group: np.ndarray) -> float:
+    """How fast y rises with x, by least squares within groups that differ by a constant; 0 where x does not vary.
+
+    Photographs of another size cost another time and other memory, which is no matter of points.
+    """
+    _, at = np.unique(group, return_inverse=True)
+    centred = x - (np.bincount(at, x) / np.bincount(at))[at]
+    square = float((centred**2).sum())
+    return float((centred * y).sum()) / square if square > 0 else 0.0
 
 
 def advice(found: ResourceEstimate) -> list[Finding]:

@@ -132,12 +132,14 @@ class SegmentCosts:
         seconds: Of a step: the median one, or the mean of the medians where some take a second view.
         peak_bytes: Most memory that the process has held by its end.
         gpu_bytes: The same of the memory of the GPU; 0 without one.
+        divisor: By which photographs were smaller at its beginning (`Stage.divisor_at`).
     """
 
     points: int
     seconds: float
     peak_bytes: int
     gpu_bytes: int = 0
+    divisor: int = 1
 
 
 @dataclass(frozen=True)
@@ -295,7 +297,8 @@ def _taken(
             state.index = index - 1
             own = [_timed(trainer, state)[1]]
         seconds += statistics.median(own) * len(indices) / sum(map(len, kinds.values()))
-    return SegmentCosts(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes())
+    divisor = trainer.stage.divisor_at(part.index + 1)
+    return SegmentCosts(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes(), divisor)
 
 
 def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:

@@ -8,10 +8,20 @@ from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
-from surfkit.apps.doctor.estimate import FixedCosts, MachineLimits, advice, duration, estimate, first_look, one_digit
+from surfkit.apps.doctor.estimate import (
+    FixedCosts,
+    MachineLimits,
+    advice,
+    duration,
+    estimate,
+    first_look,
+    one_digit,
+    slope,
+)
 from surfkit.apps.doctor.examine import examine
 from surfkit.apps.doctor.forecast import ProbePlan, beyond, forecast, schedule, within
 from surfkit.apps.doctor.growth import Growth, growth
@@ -84,6 +94,13 @@ def parts(*points):
 
 def rising(last, known=True):
     return Growth(1_000_000, last, [at / 200 for at in range(1, 101)], known)
+
+
+def test_points_are_not_charged_for_larger_photographs():
+    points, divisor = np.array([1e5, 2e5, 3e5, 4e5]), np.array([4, 4, 1, 1])
+    assert slope(points, 700 * points + 2e9 / divisor**2, divisor) == pytest.approx(700)
+    assert slope(points, 700 * points, np.ones(4)) == pytest.approx(700)
+    assert slope(np.array([1e5, 2e5]), np.array([1.0, 9.0]), np.array([4, 1])) == 0
 
 
 def test_what_was_measured_is_added_up():
