@@ -64,7 +64,7 @@ class Stage:
 
     quarter_until: Steps = 0
     """Steps up to which photographs are shown at a quarter of their width and height; 0 for none. Lengths of losses and
-    policies in pixels are then those of the small photographs. None becomes smaller than 32 pixels."""
+    policies in pixels are then those of the small photographs. No side becomes shorter than 32 pixels."""
 
     half_until: Steps = 0
     """Steps up to which photographs are shown at half of their width and height, after those at a quarter."""
