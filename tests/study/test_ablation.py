@@ -178,14 +178,16 @@ def test_the_model_table_adds_up():
 
 def test_the_gradient_table_changes_the_signal_and_then_the_loss():
     stages = [recipe.pretrain for recipe in build(GRADIENT_TABLE).values() if recipe.has_stages]
-    terms = [None, ("ssim", "l1"), ("ssim", "normal"), ("ssim",), ("ssim",), ("ssim", "depth")]
-    assert [stage.signal for stage in stages] == [LossGradient(terms=names) for names in terms]
-    assert ["depth" in stage.losses for stage in stages] == [False] * 4 + [True] * 2
+    signals = [None, ("ssim", "l1"), ("ssim", "normal"), ("ssim",), ("ssim",), ("ssim",), ("ssim", "depth")]
+    boosts = [0.0] * 4 + [0.9, 0.0, 0.0]
+    expected = [LossGradient(terms, boost) for terms, boost in zip(signals, boosts, strict=True)]
+    assert [stage.signal for stage in stages] == expected
+    assert ["depth" in stage.losses for stage in stages] == [False] * 5 + [True] * 2
     same = [evolve(evolve(stage, "signal", LossGradient()), "losses", {}) for stage in stages]
     assert all(stage == same[0] for stage in same) and same[0].densify.filters == (Elongation(),)
     assert list(built_on(GRADIENT_TABLE).values()) == [
         None,
-        *["SSIM + RGB + normal"] * 3,
+        *["SSIM + RGB + normal"] * 4,
         "SSIM",
         "SSIM, depth as a loss",
         "SSIM + RGB + normal",
