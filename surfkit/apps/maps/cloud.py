@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -69,7 +69,8 @@ def write_cloud(
     points = SortedPoints(spill, octree.low, octree.side)
     for places, colors in sample_evenly(surface, spacing**2):
         places = sheet.grid.to_map(places)
-        inside = ((places[:, :2] >= low[:2]) & (places[:, :2] <= high[:2])).all(1)
+        east, north = places[:, 0], places[:, 1]
+        inside = (east >= low[0]) & (east <= high[0]) & (north >= low[1]) & (north <= high[1])
         if sheet.grid.area is not None:
             inside = inside & sheet.grid.area.contains(places[:, :2])
         some = np.zeros(int(inside.sum()), POINT)
@@ -118,14 +119,23 @@ def sample_evenly(surface: SurfaceFile, area: float) -> Iterator[tuple[np.ndarra
             order = np.arange(number, min(last, number + BATCH_POINTS))
             number += len(order)
             owner = np.searchsorted(ends, (order + 0.5) * area, "right").clip(max=len(ends) - 1)
-            spot = (order[:, None] * R2_STEPS) % 1
-            spot = np.where(spot.sum(1, keepdims=True) > 1, 1 - spot, spot)
-            shares = np.stack([1 - spot.sum(1), spot[:, 0], spot[:, 1]], axis=1)
-            places = (shares[:, :, None] * corners[owner]).sum(1)
+            turns = order * R2_STEPS[0], order * R2_STEPS[1]
+            u, v = (turn - np.floor(turn) for turn in turns)
+            beyond = u + v > 1
+            u, v = np.where(beyond, 1 - u, u), np.where(beyond, 1 - v, v)
+            shares = (1 - (u + v))[:, None], u[:, None], v[:, None]
+            places = _mixed(shares, [corners[owner, corner] for corner in range(3)])
             colors = None
             if colored:
-                rows = surface.rows[faces[owner].ravel()]
-                values = np.stack([rows[name].reshape(-1, 3) for name in COLOR_CHANNELS], axis=2)
-                colors = np.rint((shares[:, :, None] * values).sum(1)).astype(np.uint8)
+                owned = faces[owner]
+                rows = [surface.rows[owned[:, corner]] for corner in range(3)]
+                values = [np.stack([row[name] for name in COLOR_CHANNELS], axis=1) for row in rows]
+                colors = np.rint(_mixed(shares, values)).astype(np.uint8)
             yield places, colors
         emit(Progress("sampling points", min(start + BATCH_TRIANGLES, total), total))
+
+
+def _mixed(shares: Sequence[np.ndarray], values: Sequence[np.ndarray]) -> np.ndarray:
+    """(n, 3) sum of (n, 3) values at the three corners by their (n, 1) shares; three times as fast as a sum over an
+    axis of three."""
+    return shares[0] * values[0] + shares[1] * values[1] + shares[2] * values[2]

@@ -18,6 +18,8 @@ RUN_POINTS = 1 << 21
 """Points that are sorted at once."""
 MERGED_POINTS = 1 << 20
 """Points that are merged at once, about."""
+KEYED_POINTS = 1 << 15
+"""Points whose keys are made at once: what the caches of a processor hold."""
 KEPT_KEYS = 1 << 10
 """Points of a run, one of whose keys is kept in memory."""
 
@@ -58,8 +60,12 @@ class SortedPoints:
 
     def _keys(self, points: np.ndarray) -> np.ndarray:
         """(n,) uint64 of (n,) POINT."""
-        cells = (points["place"].astype(np.int64) - self._low << KEY_BITS) // self._side
-        return morton_codes(cells.astype(np.uint64))
+        keys = np.empty(len(points), np.uint64)
+        for start in range(0, len(points), KEYED_POINTS):
+            some = slice(start, start + KEYED_POINTS)
+            cells = (points["place"][some].astype(np.int64) - self._low << KEY_BITS) // self._side
+            keys[some] = morton_codes(cells.astype(np.uint64))
+        return keys
 
     def batches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Pairs of (n,) uint64 keys and (n,) POINT, rising from pair to pair too."""
