@@ -29,6 +29,9 @@ ASSUMED_M = 3.0
 """Standard deviation of each coordinate of a position that states none, beside others that do."""
 NEAR_M = 0.1
 """A residual below it is not held against a position, nor half of it against a control point."""
+MAX_WRONG_SHARE = 0.1
+"""Where more positions that state no accuracy contradict the others, by no more than `ASSUMED_M`, they are not wrong:
+what a receiver without corrections measures drifts, from one strip of a flight to the next by a metre."""
 MAX_METRE_DIFFERENCE = 0.01
 """Units that differ from a metre by less are metres, as those of projections are."""
 
@@ -196,7 +199,10 @@ def _fitted(
     stated = np.maximum(stated, MIN_SIGMA_M) / chart.metres
     silent = np.isnan(stated[:, 0])
     assumed = np.where(silent, ASSUMED_M / chart.metres, np.linalg.norm(stated[:, :axes], axis=1) / np.sqrt(axes))
-    fit = fit_robustly(xyz, onto, None if silent.all() else assumed, seed, NEAR_M / chart.metres)
+    sigma, least = None if silent.all() else assumed, np.full(len(known), NEAR_M / chart.metres)
+    fit = fit_robustly(xyz, onto, sigma, seed, least)
+    if fit is not None and _drifts(fit, silent, ASSUMED_M / chart.metres):
+        fit = fit_robustly(xyz, onto, sigma, seed, np.where(silent, ASSUMED_M / chart.metres, least))
     if fit is None:
         return NoSimilarity(f"of {len(known)} positions fewer than {MIN_AGREEING_POSITIONS} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
@@ -222,6 +228,12 @@ def _fitted(
     own = np.maximum(fit.deviation(silent), MIN_SIGMA_M / chart.metres)
     sigma = np.where(silent[:, None], own, stated)
     return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right)
+
+
+def _drifts(fit: SimilarityFit, silent: np.ndarray, reach: float) -> bool:
+    """Whether many of the positions that state no accuracy contradict the others by a little."""
+    near = np.linalg.norm(fit.residuals, axis=1) <= reach
+    return bool((silent & near & ~fit.inside).sum() > MAX_WRONG_SHARE * silent.sum())
 
 
 def _in_plan(

@@ -89,7 +89,11 @@ def umeyama(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray) -> Similarit
 
 
 def fit_robustly(
-    xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = None, seed: int = 0, least: float = 0.0
+    xyz: np.ndarray,
+    onto: np.ndarray,
+    sigma: np.ndarray | None = None,
+    seed: int = 0,
+    least: float | np.ndarray = 0.0,
 ) -> SimilarityFit | None:
     """The similarity on which most positions agree; None where fewer than `MIN_AGREEING_POSITIONS` do.
 
@@ -98,7 +102,7 @@ def fit_robustly(
         onto: (P, 3) float64.
         sigma: (P,) standard deviations of `onto`, in its unit, where they are known; equal ones otherwise.
         seed: Of the draws.
-        least: A position with a shorter residual is never wrong, in the unit of `onto`.
+        least: A position with a shorter residual is never wrong, in the unit of `onto`; one for all, or (P,).
     """
     count = len(xyz)
     if count < MIN_AGREEING_POSITIONS:

@@ -61,6 +61,29 @@ def test_a_photograph_500_m_off_is_named_and_has_no_say():
     assert np.linalg.norm(away.mean(0)) < 2 * 3 * np.sqrt(3 / 25)
 
 
+def test_a_strip_that_a_receiver_without_corrections_put_a_metre_off_is_no_mistake():
+    onto = grid(18)
+    off = onto + np.where(np.arange(18)[:, None] % 3 == 0, (0.8, 0.8, 0.0), 0.0)
+    shots, photos = survey(off, noise=0.1)
+    shots = survey(onto)[0]
+    chart = chart_of(np.array([photo.exif.position for photo in photos]), "auto")
+    found = place(shots, photos, chart)
+    assert found.fit.inside.all()
+    away = found.similarity.points(np.stack(list(shots.values()))) - onto
+    np.testing.assert_allclose(away.mean(0), (0.8 / 3, 0.8 / 3, 0), atol=0.1)
+    assert (found.sigma[:, :2] > 0.3).all(), "as exact as they agree"
+
+
+def test_one_position_two_metres_off_is_still_left_out():
+    onto = grid(18)
+    off = onto.copy()
+    off[7, 0] += 2
+    shots, photos = survey(off, noise=0.1)
+    shots = survey(onto)[0]
+    found = place(shots, photos, chart_of(np.array([photo.exif.position for photo in photos]), "auto"))
+    assert [name for name, good in zip(found.names, found.fit.inside, strict=True) if not good] == ["7.jpg"]
+
+
 def test_a_line_determines_no_turn():
     found = placed(np.column_stack([np.linspace(0, 300, 12), np.linspace(0, 100, 12), np.full(12, 60.0)]), noise=0.5)
     assert isinstance(found, NoSimilarity) and "along a line" in found.reason
