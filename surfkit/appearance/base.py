@@ -21,7 +21,8 @@ class PhotoLight:
     what the numbers mean.
 
     Attributes:
-        stops: (V, 3) float32 of red, green and blue, with a mean of 0 over the photographs of the scene.
+        stops: (V, 3) float32 of red, green and blue. Less the falloff, averaged over the picture, they have a mean of
+            0 over the photographs of the scene.
         cameras: (V, 8) float32 vignetting and response curve of the camera that took each.
     """
 

@@ -42,8 +42,8 @@ class CameraResponse(Appearance):
     depend on the direction would explain the exposure of photographs that look the same way. So stages, and blocks of a
     scene, have the same numbers. light.json in the run folder lists them.
 
-    The mean stops and the mean curve of all photographs are no change. So the scene has the colours of the mean
-    photograph, as in the middle of a picture that has no vignetting, and files of splats have them as they are. A curve
+    The mean stops of all photographs, less the falloff averaged over the picture, and their mean curve are no change.
+    So the scene is as bright as the mean photograph, and files of splats have its colours as they are. A curve
     that all photographs share cannot be told from the scene: one camera alone has the sRGB curve.
     """
 

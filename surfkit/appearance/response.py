@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from surfkit.scene.camera import Camera
 
 FALLOFF, CENTRE, CURVE = slice(0, 3), slice(3, 5), slice(5, 8)
@@ -17,6 +19,8 @@ STOPS, OF_CAMERA = 3, 8
 """How many numbers a photograph and a camera have."""
 MAX_SLOPE_CHANGE = 0.9
 """A response curve is nowhere steeper than 1.9 times the standard one, and nowhere flatter than 0.1 times."""
+MEAN_STEPS = 64
+"""Places along each side of a picture, or around it, of which a mean is taken."""
 KNEE = 0.04045
 """sRGB is straight up to here, and a power of the light above (IEC 61966-2-1)."""
 
@@ -30,6 +34,25 @@ def falloff(values: Any, squared: Any) -> Any:
     """Stops that vignetting takes at r^2 = `squared`, by the 8 numbers of a camera, (8, ...)."""
     a, b, c = values[FALLOFF]
     return squared * (a + squared * (b + squared * c))
+
+
+def mean_falloff(values: np.ndarray, camera: Camera) -> float:
+    """Stops that vignetting takes from a picture of a camera on average, by its (8,) numbers."""
+    axes = zip((camera.width, camera.height), (camera.cx, camera.cy), values[CENTRE], strict=True)
+    x, y = (
+        ((np.arange(MEAN_STEPS) + 0.5) / MEAN_STEPS * side - middle) * sensor_scale(camera) - centre
+        for side, middle, centre in axes
+    )
+    return float(falloff(values, x**2 + y[:, None] ** 2).mean())
+
+
+def corner_light(values: np.ndarray) -> float:
+    """Light half a diagonal away from the middle of a picture, the geometric mean all around, as a share of that in the
+    middle, by the (8,) numbers of a camera."""
+    turns = np.arange(MEAN_STEPS) / MEAN_STEPS * 2 * math.pi
+    x, y = np.cos(turns) - values[CENTRE][0], np.sin(turns) - values[CENTRE][1]
+    middle = falloff(values, np.square(values[CENTRE]).sum())
+    return float(2 ** (middle - falloff(values, x**2 + y**2).mean()))
 
 
 def curved(encoded: Any, curve: Any) -> Any:

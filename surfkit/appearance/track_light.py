@@ -22,6 +22,7 @@ from surfkit.appearance.response import (
     KNEE,
     MAX_SLOPE_CHANGE,
     OF_CAMERA,
+    corner_light,
     curve_slope,
     curve_terms,
     curved,
@@ -145,8 +146,8 @@ class LightSpread:
     Attributes:
         stops: From the 10th to the 90th percentile of the exposures.
         balance: The same of red, or of blue, as shares of green; the larger one.
-        corner: Light that is left half a diagonal away from the middle, as a share of that in the middle; of the camera
-            with the darkest corners.
+        corner: Light that is left half a diagonal away from the middle of the picture, as a share of that in the
+            middle; of the camera with the darkest corners.
         curve: Largest difference, in colours in [0, 1], between the response curve of a camera and the mean one.
         cameras: How many cameras there are.
     """
@@ -166,7 +167,7 @@ class LightSpread:
         values = np.column_stack([known.mean(1), known[:, 0] - known[:, 1], known[:, 2] - known[:, 1]])
         low, high = np.percentile(values, [10, 90], axis=0)
         stops, *balance = (high - low).tolist()
-        corner = min(float(2 ** -falloff(numbers, 1.0)) for numbers in light.cameras)
+        corner = min(map(corner_light, light.cameras))
         fine = np.linspace(0, 1, 101)
         curve = max(float(np.abs(curved(fine, numbers[CURVE]) - fine).max()) for numbers in light.cameras)
         return cls(stops, 2 ** max(balance) - 1, corner, curve, len(light.cameras))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from surfkit.appearance.base import PhotoLight
-from surfkit.appearance.response import CENTRE, CURVE, FALLOFF
+from surfkit.appearance.response import CENTRE, CURVE, FALLOFF, mean_falloff
 from surfkit.appearance.track_light import MIN_SEEN, LightSpread, TrackLight, fit_light, rows_of, track_colors
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
@@ -50,11 +50,15 @@ class CameraNumbers:
         falloff: Stops at r^2, r^4 and r^6.
         centre: Where r is 0, from the principal point, in halves of the diagonal.
         curve: Terms of the response curve.
+        mean: Stops that vignetting takes from a picture on average. Colours of the scene are those of the mean
+            photograph, averaged over the picture; where it is 0, as in light.json of earlier versions, those where r
+            is 0.
     """
 
     falloff: tuple[float, float, float]
     centre: tuple[float, float]
     curve: tuple[float, float, float]
+    mean: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -139,13 +143,16 @@ def light_by_tracks(views: Sequence[View], tracks: Observations) -> TrackLight:
 
 def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:
     """A fit to some views, by name."""
+    lenses = {view.taken_by: view.camera for view in reversed(views)}  # of the first view of each
     names = list(dict.fromkeys(view.taken_by for view in views))
     photographs = {
         view.name: PhotoNumbers(tuple(stops.tolist()), view.taken_by, int(seen))
         for view, stops, seen in zip(views, light.stops, light.seen, strict=True)
     }
     cameras = {
-        name: CameraNumbers(*(tuple(numbers[part].tolist()) for part in (FALLOFF, CENTRE, CURVE)))
+        name: CameraNumbers(
+            *(tuple(numbers[part].tolist()) for part in (FALLOFF, CENTRE, CURVE)), mean_falloff(numbers, lenses[name])
+        )
         for name, numbers in zip(names, light.cameras, strict=True)
     }
     return LightRecord(photographs, cameras, light.deviation, LightSpread.of(light))
@@ -220,4 +227,5 @@ def held_out_response(run: Run, stage: RunStage) -> Callable[[View, Maps], Maps]
 
 def _photo_light(stops: Sequence[tuple[float, float, float]], cameras: Sequence[CameraNumbers]) -> PhotoLight:
     numbers = np.array([[*camera.falloff, *camera.centre, *camera.curve] for camera in cameras], np.float32)
-    return PhotoLight(torch.tensor(stops, dtype=torch.float32), torch.from_numpy(numbers))
+    mean = torch.tensor([[camera.mean] for camera in cameras])
+    return PhotoLight(torch.tensor(stops, dtype=torch.float32) + mean, torch.from_numpy(numbers))

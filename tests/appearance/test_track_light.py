@@ -5,6 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
+from surfkit.appearance import response
 from surfkit.appearance.response import curved
 from surfkit.appearance.track_light import (
     MIN_SEEN,
@@ -50,6 +51,17 @@ def test_exposure_balance_and_vignetting_are_found():
     assert np.abs(corner_light(light.cameras[0])).max() < 0.01
     assert not light.cameras[0, 5:].any() and np.abs(light.cameras[0, 3:5]).max() < 0.01
     assert light.deviation < 0.005 and (light.seen > 50).all()
+
+
+def test_corners_are_those_of_the_picture_wherever_the_vignetting_is_centred():
+    values = np.array([0.5, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert response.corner_light(values) == pytest.approx(0.5)
+    values = np.array([-0.7, 0.23, 0.0, -0.8, -0.5, 0.0, 0.0, 0.0])
+    x, y = np.mgrid[-1:1:200j, -1:1:200j]
+    ring = np.abs(np.hypot(x, y) - 1) < 0.01
+    r2 = (x + 0.8) ** 2 + (y + 0.5) ** 2
+    light = 0.7 * r2 - 0.23 * r2**2
+    assert response.corner_light(values) == pytest.approx(2 ** (light[ring].mean() - light[100, 100]), rel=0.02)
 
 
 def test_a_quarter_of_wrong_sights_and_noise_change_little():

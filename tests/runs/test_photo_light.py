@@ -8,9 +8,9 @@ from PIL import Image
 from two_blocks import EVERY, STEPS, stop_after
 
 from surfkit.appearance import CameraResponse
-from surfkit.appearance.track_light import TrackColors
+from surfkit.appearance.track_light import TrackColors, TrackLight
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import read_json, write_json
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.partition import PictureShare, QuantileGrid
@@ -18,7 +18,7 @@ from surfkit.raster.psnr import psnr
 from surfkit.runs import photo_light, pipeline
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
-from surfkit.runs.photo_light import LightRecord, held_out_response, light_of
+from surfkit.runs.photo_light import LightRecord, _photo_light, held_out_response, light_of, recorded
 from surfkit.runs.pipeline import load_run, loaded, opened, run
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.photos import view_photo
@@ -64,8 +64,8 @@ def test_a_run_finds_exposures_first_and_resumes_with_the_same_bits(data, recipe
     off = stops - 0.5 * (-1.0) ** np.arange(len(stops))[:, None]
     assert np.abs(off - off.mean(0)).max() < 0.15 and np.abs(stops.mean(0)).max() < 1e-9
     assert list(record.cameras) == ["camera 1"] and record.cameras["camera 1"].curve == (0, 0, 0)
-    value = states[0].appearances["value"]
-    assert torch.allclose(value[:, :3].double(), torch.from_numpy(stops)) and value.shape == (len(stops), 11)
+    value, mean = states[0].appearances["value"], record.cameras["camera 1"].mean
+    assert torch.allclose(value[:, :3].double(), torch.from_numpy(stops + mean)) and value.shape == (len(stops), 11)
 
 
 def test_blocks_have_the_numbers_of_the_whole_scene(data, recipe, tmp_path):
@@ -104,6 +104,36 @@ def test_numbers_that_are_gone_are_named(data, recipe, tmp_path):
     stranger = replace(scene.train[0], name="stranger.png")
     with pytest.raises(BadInput, match="light.json: it lacks 'stranger.png'; delete it"):
         light_of(opened(tmp_path), [scene.train[1], stranger])
+
+
+@pytest.mark.parametrize("falloff", [(1.0, 0.0, 0.0), (-0.7, 0.2, 0.0)])
+def test_the_scene_is_as_bright_as_the_mean_photograph(data, falloff):
+    """A fit may centre the vignetting far from the middle, where what it takes from the middle means nothing."""
+    views = read(data).train
+    stops = np.array([[0.5, 0.5, 0.5], [-0.5, -0.5, -0.5]] * (len(views) // 2))
+    light = TrackLight(stops, np.array([[*falloff, -0.8, -0.5, 0, 0, 0]]), np.full(len(views), 99), 0.01)
+    record = recorded(light, views)
+    grey = torch.full((3, 48, 64), 0.3)
+    model, known = (
+        CameraResponse(),
+        _photo_light(
+            [record.photographs[view.name].stops for view in views], [record.cameras[view.taken_by] for view in views]
+        ),
+    )
+    taken = [model(numbers, grey, view.camera) for numbers, view in zip(model.begin_with(known), views, strict=True)]
+    ratio = [np.log2(linear(each.numpy().astype(np.float64)) / linear(0.3)).mean() for each in taken]
+    assert np.mean(ratio) == pytest.approx(0, abs=2e-3) and np.ptp(ratio) == pytest.approx(1, abs=1e-3)
+
+
+def test_light_of_earlier_versions_is_taken_as_it_was(data, tmp_path):
+    record = recorded(
+        TrackLight(np.zeros((1, 3)), np.array([[1.0, *[0.0] * 7]]), np.array([99]), 0.01), read(data).train[:1]
+    )
+    assert record.cameras["camera 1"].mean == pytest.approx(1 / 3, rel=0.02)  # the mean of r^2
+    before = asdict(record)
+    del before["cameras"]["camera 1"]["mean"]
+    write_json(tmp_path / "light.json", before)
+    assert read_json(tmp_path / "light.json", LightRecord).cameras["camera 1"].mean == 0
 
 
 def test_uneven_light_is_told_where_no_stage_learns_it(data, recipe, tmp_path, capsys):
@@ -177,7 +207,7 @@ def test_held_out_photographs_are_drawn_as_their_camera_takes_them(recipe, tmp_p
         view = ctx.scene.held_out[0]
         plain, taken = (draw(view).need("color") for draw in (made.draw, made.photographed(made.draw)))
         stops = np.log2(linear(taken.numpy()).clip(1e-6) / linear(plain.numpy()).clip(1e-6))
-        assert np.abs(stops[:, 24, 32]).max() < 0.1 and -2.0 < np.median(stops[:, 0, 0]) < -1.0
+        assert np.abs(stops[:, 24, 32] - 0.5).max() < 0.1 and -1.5 < np.median(stops[:, 0, 0]) < -0.5  # 0 on average
         wanted, photo = read_json(tmp_path / "run/metrics.json", dict[str, Any]), view_photo(view).float() / 255
         assert wanted["images"]["per_image"][view.name]["psnr"] == pytest.approx(psnr(taken.clamp(0, 1), photo), 1e-4)
 
