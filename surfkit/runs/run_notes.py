@@ -88,6 +88,30 @@ def collect_notes() -> Iterator[RunNotes]:
         plugins().unregister(notes)
 
 
+class _Heard:
+    """Keeps the warnings that are told."""
+
+    def __init__(self) -> None:
+        self.texts: dict[str, None] = {}
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if isinstance(event, Warned):
+            self.texts[event.text] = None
+
+
+@contextmanager
+def hear_warnings() -> Iterator[dict[str, None]]:
+    """Within, a dictionary whose keys are the warnings that are told, each once, in their order."""
+    heard = _Heard()
+    plugins().register(heard)
+    try:
+        yield heard.texts
+    finally:
+        plugins().unregister(heard)
+
+
 @contextmanager
 def prefix_notes(prefix: str) -> Iterator[None]:
     """Within, warnings are those of a part of the run, and begin with its name."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
+from surfkit.runs.run_notes import hear_warnings
 
 MAKE_RECORD = "make.json"
 
@@ -24,6 +25,7 @@ class FinishedStep:
         seconds: That it took, all calls together.
         complete: Whether it came to its end.
         files: What it wrote, inside the delivery.
+        notes: Its warnings, those of earlier calls too.
     """
 
     folder: str
@@ -31,6 +33,7 @@ class FinishedStep:
     seconds: float = 0.0
     complete: bool = False
     files: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass
@@ -133,12 +136,13 @@ class Delivery:
         """
         before = self.record.steps.get(name)
         was_done = before is not None and before.complete and before.key == key
-        spent = before.seconds if before is not None and before.key == key else 0.0
-        step = FinishedStep(folder.relative_to(self.out).as_posix(), key, spent)
+        same = before if before is not None and before.key == key else FinishedStep("")
+        spent, step = same.seconds, FinishedStep(folder.relative_to(self.out).as_posix(), key, same.seconds)
         self.record.steps[name] = step
         began = time.perf_counter()
         try:
-            step.files = tuple(path.relative_to(self.out).as_posix() for path in work())
+            with hear_warnings() as heard:
+                step.files = tuple(path.relative_to(self.out).as_posix() for path in work())
             step.complete = True
         except (BadInput, Fault) as error:
             error.args = (f"step {name}: {error}; finished steps are kept: then `{self.command}` goes on",)
@@ -146,6 +150,7 @@ class Delivery:
         finally:
             if not (was_done and step.complete):  # to look whether it is finished is not counted
                 step.seconds = round(spent + time.perf_counter() - began, 1)
+            step.notes = tuple(dict.fromkeys([*same.notes, *heard]))
             self.write()
 
 

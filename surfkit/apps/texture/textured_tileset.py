@@ -81,7 +81,7 @@ class TilesetWriter:
     def finish(self, region: Region) -> None:
         """Write tileset.json for the region of all."""
         root, _ = self._tile(region)
-        write_json(self.folder / INDEX, tileset(root, self.ground.matrix))
+        write_json(self.folder / INDEX, tileset(root, self.ground.matrix, self.ground.notes))
 
     def _tile(self, region: Region) -> tuple[dict[str, Any], np.ndarray]:
         """The JSON of a tile and of all below it, and the (2, 3) corners of its box."""

@@ -93,14 +93,14 @@ class Tiles3D(Format):
             means = torch.from_numpy(ground.metres(table.means.detach().cpu().double().numpy()))
             return replace(table, means=means, log_scales=table.log_scales + float(np.log(ground.unit)))
 
-        return TileOrigin(moved, ground.unit * REFINE_ERROR_PX / self.error_px, ground.matrix)
+        return TileOrigin(moved, ground.unit * REFINE_ERROR_PX / self.error_px, ground.matrix, ground.notes)
 
     def _index(self, root: dict[str, Any], place: TileOrigin) -> dict[str, Any]:
         """The JSON of a tileset."""
         names = {"extensionsUsed": extensions_of(self.compress)}
         if self.compress == "spz":
             names["extensionsRequired"] = extensions_of(self.compress)
-        return tileset(root, place.matrix, extensionsUsed=[CONTENT], extensions={CONTENT: names})
+        return tileset(root, place.matrix, place.notes, extensionsUsed=[CONTENT], extensions={CONTENT: names})
 
 
 @dataclass(frozen=True)
@@ -111,11 +111,13 @@ class TileOrigin:
         moved: Splats about the origin of the tileset, metres, of splats as they were given.
         error: Geometric error, metres, per error of a tile as given.
         matrix: (4, 4) from the tileset to ECEF, or to z up.
+        notes: What is doubtful of their place on Earth.
     """
 
     moved: Callable[[SplatTable], SplatTable]
     error: float
     matrix: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
 def _written(

@@ -5,7 +5,7 @@ Source: OGC 22-025r4, 3D Tiles 1.1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,13 @@ class TilesetPlacement:
         metres: (P, 3) float64 metres about the origin of the tileset, of (P, 3) coordinates in the frame of the input.
         unit: Metres per unit of these.
         matrix: (4, 4) from the tileset to ECEF, or to z up.
+        notes: What is doubtful of its place on Earth.
     """
 
     metres: Callable[[np.ndarray], np.ndarray]
     unit: float
     matrix: np.ndarray
+    notes: tuple[str, ...] = ()
 
 
 def ground_of(
@@ -57,7 +59,7 @@ def ground_of(
     if site is not None:
         for note in site.notes:
             emit(Warned(note))
-        return TilesetPlacement(site.local, site.unit, site.pose)
+        return TilesetPlacement(site.local, site.unit, site.pose, site.notes)
     if georeference:
         emit(
             Warned(
@@ -95,19 +97,21 @@ def box_json(corners: np.ndarray) -> dict[str, Any]:
     return {"box": [*((low + high) / 2).tolist(), *np.diag((high - low) / 2).ravel().tolist()]}
 
 
-def tileset(root: dict[str, Any], matrix: np.ndarray, **more: Any) -> dict[str, Any]:
+def tileset(root: dict[str, Any], matrix: np.ndarray, notes: Sequence[str] = (), **more: Any) -> dict[str, Any]:
     """The JSON of a tileset.
 
     Args:
         root: The root tile, with a box.
         matrix: (4, 4) see `TilesetPlacement`.
+        notes: The same; `asset.extras.notes`.
         more: Other members of the JSON.
     """
     if not np.array_equal(matrix, np.eye(4)):
         root = {**root, "transform": matrix.T.ravel().tolist()}
+    extras = {"generator": f"surfkit {own_version()}"} | ({"notes": list(notes)} if notes else {})
     halves = np.array(root["boundingVolume"]["box"][3:]).reshape(3, 3).sum(0)
     return {
-        "asset": {"version": "1.1", "extras": {"generator": f"surfkit {own_version()}"}},
+        "asset": {"version": "1.1", "extras": extras},
         **more,
         "geometricError": max(root["geometricError"], float(2 * np.linalg.norm(halves))),
         "root": {"refine": "REPLACE", **root},

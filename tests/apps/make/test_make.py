@@ -96,6 +96,10 @@ def test_interrupted_after_each_step_it_goes_on_and_repeats_none(farm, unmeasure
     opened |= {"quality report", "report"}
     assert opened <= set(told["files"]) and all((out / path).exists() for path in told["files"].values())
     assert told["left_out"] == {} and json.loads((out / "run/metrics.json").read_text())["steps"] == 4
+    notes = told["steps"]["texture"]["notes"]
+    assert [note for note in notes if "no place on Earth" in note], "of the tiles; told when the step was interrupted"
+    page = (out / "quality_report.html").read_text()
+    assert f"texture: {notes[0][:30]}" in page
 
     (out / "texture/textured.glb").unlink()
     assert make(farm) == 0 and seen == [*STEPS, "texture"], "only what is gone"

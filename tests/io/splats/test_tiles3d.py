@@ -121,6 +121,8 @@ def test_heights_above_sea_level_are_raised_by_the_geoid_or_told_of(tmp_path, mo
     found = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*place)[2]
     assert found == pytest.approx(height, abs=1e-3)
     assert said is None or said in told[0].text
+    kept = tileset(tmp_path / "t")["asset"]["extras"].get("notes", [])
+    assert kept == [each.text for each in told], "who opens the tiles has not seen the terminal"
 
 
 def test_what_has_no_place_on_earth_leaves_nothing_behind(tmp_path):

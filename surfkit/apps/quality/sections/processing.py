@@ -72,7 +72,15 @@ def processing(survey: Survey) -> Section:
                 if value is not None and name not in HIDDEN
             ]
             elements.append(facts(title, rows, "Those that are given, or have a default."))
-    notes = [*texts(survey.record, "notes"), *(f"left out: {name}: {why}" for name, why in _left_out(survey).items())]
+    steps = mapping(survey.delivery, "steps")
+    of_steps = (
+        f"{name}: {note}" for name in steps if name != "surface" for note in texts(mapping(steps, name), "notes")
+    )
+    notes = [
+        *texts(survey.record, "notes"),
+        *of_steps,
+        *(f"left out: {name}: {why}" for name, why in _left_out(survey).items()),
+    ]
     elements += [Paragraph(f"Note: {note}") for note in notes]
     return Section("Processing", tuple(elements))
 
