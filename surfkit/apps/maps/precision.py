@@ -4,7 +4,8 @@ A photograph confirms a cell if its own stereo depth there agrees with the surfa
 exact the height is: where they come from and how many they are (an intersection of rays, each exact to some pixels, as
 in Förstner and Wrobel 2016, Photogrammetric Computer Vision, 13.2), how far they disagree, and how steep the surface
 is within a pixel, as a place that is off by a share of a pixel has the height of its neighbour. The weights of the
-three were fitted to a rendered city with an exact surface (`bench/precision.py`).
+three were fitted to a rendered city with an exact surface (`bench/precision.py`). Pixels are those of the depth maps:
+stereo at half the size is half as exact.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from surfkit.scene.scene import Frame, View
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
-RAY_ERROR_PX = 0.06
+RAY_ERROR_PX = 0.05
 """Standard deviation of a ray, pixels."""
-DISAGREEMENT_SHARE = 0.16
+DISAGREEMENT_SHARE = 0.10
 """Of the root mean square by which rays miss the surface in height: what is left of it in their mean."""
-STEP_SHARE = 0.72
-"""Of the greatest difference of heights within a pixel around."""
+STEP_SHARE = 0.68
+"""Of the greatest difference of heights within a pixel around, by the slope there."""
 AGREEING_PX, STEEPEST = 3.0, 3.0
 """A ray agrees with the surface within so many pixels, times what the slope makes of that; slopes up to this count."""
 LEAST_CONFIDENCE = 0.25
@@ -115,7 +116,8 @@ class Rays:
                 if may_show(box, view.camera)[0] and (prior := self.priors[at]) is not None:
                     met.add(view.camera, prior)
         sigma, count = np.full((window.height, window.width), np.nan), np.zeros((window.height, window.width))
-        sigma[row, column] = np.hypot(met.sigma(), STEP_SHARE * steps[row, column])
+        slopes = steps[row, column] / (self.reach * self.grid.gsd)
+        sigma[row, column] = np.hypot(met.sigma(), STEP_SHARE * slopes * met.pixel())
         count[row, column] = met.count
         return sigma, count
 
@@ -149,22 +151,24 @@ class Meetings:
         self.count = np.zeros(len(places))
         self.squares = np.zeros(len(places))
         """Of the differences of heights, units of the input."""
+        self.pixels = np.zeros(len(places))
+        """Sum of the sides of pixels on the surface, units of the input."""
         self.information = np.zeros((len(places), 6))
         """Upper triangles of the normal matrices of the intersections, pixels per local unit, squared."""
 
     def add(self, camera: Camera, prior: DepthPrior) -> None:
         """Count the rays of a photograph."""
-        inverse, confidence = prior.inverse.numpy(), prior.confidence.numpy()
+        known = prior.inverse.numpy(), prior.confidence.numpy(), prior.coarseness
         pose, centre = camera.world_to_camera.numpy().astype(np.float64), camera.centre.numpy().astype(np.float64)
         for first in range(0, len(self.places), BATCH_CELLS):
             part = slice(first, first + BATCH_CELLS)
-            self._add_some(part, camera, (inverse, confidence), pose, centre)
+            self._add_some(part, camera, known, pose, centre)
 
     def _add_some(
         self,
         part: slice,
         camera: Camera,
-        known: tuple[np.ndarray, np.ndarray],
+        known: tuple[np.ndarray, np.ndarray, float],
         pose: np.ndarray,
         centre: np.ndarray,
     ) -> None:
@@ -180,16 +184,21 @@ class Meetings:
         rising, steepness = self.rising[part][rows], self.steepness[part][rows]
         facing = -(away * rising).sum(1) / (np.linalg.norm(away, axis=1) * steepness)
         higher = (away * rising).sum(1) * (1 / (inverse * z[rows]) - 1) / self.scale
-        pixel = z[rows] / min(camera.fx, camera.fy) / self.scale
+        pixel = known[2] * z[rows] / min(camera.fx, camera.fy) / self.scale
         agreeing = np.abs(higher) <= AGREEING_PX * pixel * np.minimum(steepness, np.hypot(STEEPEST, 1))
         chosen = np.flatnonzero(agreeing & (facing >= LEAST_FACING))
         rows, higher = rows[chosen], higher[chosen]
         self.count[part][rows] += 1
         self.squares[part][rows] += higher**2
-        across = camera.fx / z[rows, None] * (pose[0, :3] - (x / z)[rows, None] * pose[2, :3])
-        along = camera.fy / z[rows, None] * (pose[1, :3] - (y / z)[rows, None] * pose[2, :3])
+        self.pixels[part][rows] += pixel[chosen]
+        across = camera.fx / known[2] / z[rows, None] * (pose[0, :3] - (x / z)[rows, None] * pose[2, :3])
+        along = camera.fy / known[2] / z[rows, None] * (pose[1, :3] - (y / z)[rows, None] * pose[2, :3])
         for entry, (i, j) in enumerate(UPPER):
             self.information[part, entry][rows] += across[:, i] * across[:, j] + along[:, i] * along[:, j]
+
+    def pixel(self) -> np.ndarray:
+        """(n,) mean side of a pixel of the depth maps that confirm each place, on the surface, units of the input."""
+        return self.pixels / np.maximum(self.count, 1)
 
     def sigma(self) -> np.ndarray:
         """(n,) standard deviations of the heights as rays tell them, units of the input; NaN for too few rays."""

@@ -52,12 +52,14 @@ class DepthPrior:
         typical: Inverse depth that is typical of the data set, 1/local units.
         normal: (3, H, W) float32 unit normals of the surface in the camera's axes, towards the camera; 0 where there is
             none. None where the data set has no normals.
+        coarseness: Side of a pixel of the map that it was read from, pixels of the photograph; at least 1.
     """
 
     inverse: Tensor
     confidence: Tensor
     typical: float
     normal: Tensor | None = None
+    coarseness: float = 1.0
 
 
 Priors = Cache["DepthPrior | None"]
@@ -135,7 +137,7 @@ def _read(view: View, fit: ScaleOffsetFit, typical: float, normals: bool) -> Dep
         normal = fit.file.read_normal() if normals else None
     except BadInput as error:
         raise BadInput(f"{fit.file.path}: {error}") from error
-    inverse = inverse.nan_to_num(0, 0, 0).clamp_min(0)
+    inverse, coarseness = inverse.nan_to_num(0, 0, 0).clamp_min(0), max(1.0, size[1] / inverse.shape[1])
     beside = [None if part is None else torch.from_numpy(np.array(part)) for part in (confidence, normal)]
     trust, facing = (None if part is None else part.reshape(-1, *inverse.shape) for part in beside)
     if (lens := lens_in(view, fit.file, inverse.shape, fit.straight)) is not None:
@@ -145,9 +147,9 @@ def _read(view: View, fit: ScaleOffsetFit, typical: float, normals: bool) -> Dep
     inverse = resized(inverse, size)
     there = (inverse > 0).to(torch.float32)
     if trust is None:
-        return DepthPrior(inverse, there, typical, facing)
+        return DepthPrior(inverse, there, typical, facing, coarseness)
     grown = interpolate(trust[None], size, mode="nearest-exact")[0, 0]
-    return DepthPrior(inverse, grown * there, typical, facing)
+    return DepthPrior(inverse, grown * there, typical, facing, coarseness)
 
 
 def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:

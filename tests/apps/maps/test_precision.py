@@ -1,6 +1,7 @@
 """Expected errors of heights, against closed forms and against errors that are known."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,8 +102,28 @@ def test_a_step_counts_within_a_pixel():
     field = np.full((20 + 2 * rays.margin,) * 2, GROUND)
     field[:, 10 + rays.margin :] -= 0.4
     sigma, _ = rays.over(next(grid.tiles(100)), field)
-    assert (sigma[:, 9:11] > STEP_SHARE * 0.4).all()
-    assert (sigma[:, :9] < STEP_SHARE * 0.4).all() and (sigma[:, 11:] < STEP_SHARE * 0.4).all()
+    within = STEP_SHARE * 0.4 / 2  # cells are of two pixels
+    assert (sigma[:, 9:11] > within).all()
+    assert (sigma[:, :9] < within).all() and (sigma[:, 11:] < within).all()
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_maps_of_pixels_three_times_as_large_are_a_third_as_exact(slope):
+    """Stereo at a third of the size: in all parts of the error but what the rays themselves show."""
+    views, prior = [nadir(-10), nadir(10)], depth_of(HEIGHT)
+    grid = grid_of(0.5, UTM[0] + 5, UTM[1] + 5, UTM[0] + 15, UTM[1] + 15)
+    field = GROUND + slope * 0.001 * np.arange(30)[None] + np.zeros((30, 1))
+    sigma = []
+    for coarseness in (1.0, 3.0):
+        rays = Rays(views, [replace(prior, coarseness=coarseness)] * 2, FRAME, grid, 0.5)
+        sigma.append(rays.over(next(grid.tiles(100)), field[: 20 + 2 * rays.margin, : 20 + 2 * rays.margin])[0])
+    assert sigma[1] == pytest.approx(3 * sigma[0], rel=2e-3)
+
+
+def test_what_one_of_larger_pixels_may_contradict():
+    views, far = [nadir(-10), nadir(10)], depth_of(HEIGHT + 1)  # of pixels of 0.25 m, four
+    assert (over(views, [far, far])[1] == 0).all()
+    assert (over(views, [replace(far, coarseness=2.0)] * 2)[1] == 2).all()
 
 
 def hilly(x, y):

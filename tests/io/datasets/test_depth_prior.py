@@ -339,7 +339,9 @@ def test_memory_is_bounded_and_priors_are_read_ahead(farm):
         assert small.bytes <= budget
     half = replace(scene.train[0], camera=scene.train[0].camera.resized(32, 24))
     smaller = read_priors(data, replace(scene, train=(half, *scene.train[1:])))[0]
-    assert smaller.inverse.shape == smaller.confidence.shape == (24, 32)
+    assert smaller.inverse.shape == smaller.confidence.shape == (24, 32) and smaller.coarseness == 1
+    twice = replace(scene.train[0], camera=scene.train[0].camera.resized(128, 96))
+    assert read_priors(data, replace(scene, train=(twice, *scene.train[1:])))[0].coarseness == 2
 
 
 def test_normals_are_kept_in_bytes_and_given_as_unit_vectors(made, farm):
