@@ -25,7 +25,9 @@ from surfkit.core.memory import size
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
 from surfkit.io.datasets.data import Data
+from surfkit.mesh.visibility import Visibility
 from surfkit.partition.grid import ContractedGrid
+from surfkit.raster import native
 from surfkit.raster.select import Device
 from surfkit.runs.recipe import Recipe, with_steps
 
@@ -34,6 +36,8 @@ PROBE_STEPS = 25
 LEAST_SHARE = 0.1
 """Of the likely points that must fit into memory, for a coarse model and blocks to be of use."""
 BLOCKS = "surface-blocks"
+CLOSED = "visibility"
+"""Name of the mesher."""
 SEPARATE_FINDINGS = ("memory", "gpu-memory", "first-look", "forecast")
 """Kinds of findings of the forecast that the decisions tell in their own words."""
 
@@ -65,7 +69,8 @@ def decide(data: Data, name: QualityName, steps: int | None, device: Device, out
     for finding in (*told, *more_told):
         if finding.level == "warning" and finding.what not in SEPARATE_FINDINGS:
             say(f"{finding.level}: {finding.text}")
-    return chosen(quality, found, count, length)
+    # One continuous surface is what a client can use; its cut is compiled code.
+    return replace(chosen(quality, found, count, length), mesher=None if native.module() is None else CLOSED)
 
 
 def _forecast(
@@ -135,6 +140,8 @@ def recipe_of(decisions: Decisions) -> Recipe:
             stage = replace(stage, densify=capped)
         grid = ContractedGrid(blocks=(decisions.blocks, decisions.blocks))
         recipe = replace(recipe, partition=grid, pretrain=stage, start=recipe.start.limited(most))
+    if decisions.mesher == CLOSED:
+        recipe = replace(recipe, mesh=Visibility(oversampling=getattr(recipe.mesh, "oversampling", 1.0)))
     return with_steps(recipe, decisions.steps)
 
 
@@ -145,6 +152,8 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
         ("recipe", f"recipe:{decisions.recipe}, {decisions.steps:,} steps"),
         ("why", decisions.why),
     ]
+    if decisions.mesher is not None:
+        found.append(("mesh", f"mesh:{decisions.mesher}, closed where something was seen"))
     if decisions.blocks is not None:
         side = f"{decisions.blocks} x {decisions.blocks}"
         found.append(("blocks", f"{side}, after a coarse model of at most {decisions.points:,} points"))

@@ -57,6 +57,7 @@ class Decisions:
         blocks: Blocks along each side, where the scene is divided.
         points: Most points of the coarse model, where the scene is divided.
         forecast: None where none could be made.
+        mesher: Name of the method that makes the mesh; None for that of the recipe.
     """
 
     recipe: str
@@ -66,6 +67,7 @@ class Decisions:
     blocks: int | None = None
     points: int | None = None
     forecast: Forecast | None = None
+    mesher: str | None = None
 
     def longer(self, steps: int) -> Decisions:
         """The same with another number of steps, whose time follows from what was measured."""

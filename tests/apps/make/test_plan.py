@@ -12,6 +12,8 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.densify.filters import CountCap, Elongation
 from surfkit.io.datasets.data import ReadSettings
+from surfkit.mesh import TSDF
+from surfkit.mesh.visibility import Visibility
 from surfkit.runs.recipe import complete
 
 from .test_make import estimated
@@ -62,6 +64,14 @@ def test_what_the_presets_are():
     given = ReadSettings(scale=2.0)
     assert all(each.reading(given) is given for each in QUALITIES.values())
     assert all(known[each.recipe].test_every == 0 for each in QUALITIES.values()), "every photograph is trained on"
+
+
+def test_the_mesh_that_is_delivered_is_closed_and_as_fine_as_that_of_the_recipe():
+    own = recipe_of(Decisions("surface", "", 40, 100))
+    made = recipe_of(Decisions("surface", "", 40, 100, mesher="visibility"))
+    assert isinstance(own.mesh, TSDF), "deliveries of earlier versions go on with the mesh that they have"
+    assert isinstance(made.mesh, Visibility) and made.mesh.oversampling == own.mesh.oversampling == 1.5
+    assert replace(made, mesh=own.mesh) == own
 
 
 def test_a_longer_run_takes_as_much_longer():
