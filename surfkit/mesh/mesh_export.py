@@ -23,6 +23,8 @@ BATCH_ROWS = 1 << 20
 """Rows that are written at once."""
 GLTF_UP_MATRIX = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
 """By columns, z up to y up, as glTF has it."""
+GLB_UNKNOWN = -1.0
+"""A value of a vertex that is not known, in GLB: glTF forbids NaN, and no value is below 0."""
 
 
 def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
@@ -80,7 +82,8 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     """GLB, and NAME.glb.json, which names the offset. Colours are linear, as glTF has them.
 
-    Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore.
+    Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore. Those that
+    are not known are `GLB_UNKNOWN`.
 
     Raises:
         BadInput: More than 4 GiB.
@@ -101,7 +104,8 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
         about = {"componentType": UNSIGNED_SHORT, "normalized": True, "type": "VEC4"}
         attributes["COLOR_0"] = blocks.accessor(view, count=count, **about)
     for name, each in in_files(mesh, frame).items():
-        view = blocks.add(4 * count, each.tobytes, target=VERTICES, byteStride=4)
+        known = np.where(np.isfinite(each), each, np.float32(GLB_UNKNOWN))
+        view = blocks.add(4 * count, known.tobytes, target=VERTICES, byteStride=4)
         attributes[f"_{name.upper()}"] = blocks.accessor(view, count=count, componentType=FLOAT, type="SCALAR")
     document = {
         "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"},

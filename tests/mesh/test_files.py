@@ -11,6 +11,7 @@ from needs import needs
 from surfkit.apps.view.viewer_scene import local_mesh
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.io.glb import FLOAT, GlbWriter, write_glb
 from surfkit.mesh.base import Mesh, require_values
 from surfkit.mesh.mesh_export import write_mesh
 from surfkit.mesh.simplify import simplify_to
@@ -200,6 +201,34 @@ def test_values_are_attributes_of_glb(tmp_path):
     (read,) = trimesh.load(path, process=False).geometry.values()
     assert np.array_equal(np.ravel(read.vertex_attributes["_VIEWS"]), mesh.values["views"])
     assert np.array_equal(read.faces, mesh.faces) and "color" in read.visual.vertex_attributes
+
+
+def test_what_is_not_known_is_below_zero_in_glb_and_nan_in_ply(tmp_path):
+    """glTF 2.0, 3.6.2.1: an accessor has no NaN and no Inf."""
+    mesh = with_values()
+    mesh.values["error"][::3] = np.nan
+    mesh.values["error"][1] = np.inf
+    wanted = np.where(np.isfinite(mesh.values["error"]), mesh.values["error"] / np.float32(0.01), -1)
+    write_mesh(tmp_path / "mesh.glb", mesh, UTM)
+    (read,) = trimesh.load(tmp_path / "mesh.glb", process=False).geometry.values()
+    assert np.ravel(read.vertex_attributes["_ERROR"]) == pytest.approx(wanted, rel=1e-6)
+    write_mesh(tmp_path / "mesh.ply", mesh, UTM)
+    assert np.isnan(read_surface(tmp_path / "mesh.ply").rows["error"][::3]).all()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_glb_file_that_would_not_be_valid_is_not_written(tmp_path, wrong):
+    """Of the corners, the ends in the JSON show it; of other numbers, the bytes."""
+    places = ball().vertices.copy()
+    places[5, 1] = wrong
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_mesh(tmp_path / "mesh.glb", replace(ball(), vertices=places), Frame(np.zeros(3), 1.0))
+    blocks = GlbWriter()
+    numbers = np.array([1, wrong, 2], "<f4")
+    blocks.accessor(blocks.add(12, numbers.tobytes), count=3, componentType=FLOAT, type="SCALAR")
+    with pytest.raises(ValueError, match=r"bad\.glb: bufferViews\[0\] would have NaN or Inf"):
+        write_glb(tmp_path / "bad.glb", {}, blocks, "")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
