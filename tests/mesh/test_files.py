@@ -40,8 +40,20 @@ def test_coordinates_are_those_of_the_input_to_a_tenth_of_a_millimetre(tmp_path,
     read = trimesh.load(path, process=False, maintain_order=True)
     assert np.abs(read.vertices + SHIFT - UTM.to_input(mesh.vertices)).max() < 1e-4
     assert np.array_equal(read.faces, mesh.faces)
-    assert np.abs(colors_of(read).astype(int) - mesh.colors).max() <= (1 if kind == "obj" else 0)
+    assert np.array_equal(colors_of(read), mesh.colors)
     assert b"EPSG:32632" in path.read_bytes()[:300]
+
+
+def test_colours_of_obj_are_the_same_bytes_rounded_or_cut_off(tmp_path):
+    """MeshLab cuts off what Blender rounds, in 32 bits."""
+    colors = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+    places = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
+    write_mesh(tmp_path / "mesh.obj", Mesh(places, np.array([[0, 1, 2]], np.int32), colors), UTM)
+    lines = [line.split()[4:] for line in (tmp_path / "mesh.obj").read_text().splitlines() if line.startswith("v ")]
+    for kind in (np.float32, np.float64):
+        found = np.array(lines, kind) * kind(255)
+        assert np.array_equal(np.floor(found), colors) and np.array_equal(np.rint(found), colors)
+        assert found.max() == 255
 
 
 def test_glb_has_an_offset_beside_it(tmp_path):
@@ -168,8 +180,9 @@ def test_a_glb_file_byte_for_byte(tmp_path, monkeypatch):
     write_mesh(path, Mesh(corners, np.array([[0, 1, 2]], np.int32)), Frame(np.zeros(3), 1.0))
     text = (
         b'{"asset":{"version":"2.0","generator":"surfkit 1.2.3"},"scene":0,"scenes":[{"nodes":[0]}],'
-        b'"nodes":[{"mesh":0}],"materials":[{"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},'
-        b'"doubleSided":true}],"meshes":[{"primitives":[{"attributes":{"POSITION":0},"indices":1,'
+        b'"nodes":[{"mesh":0,"name":"surface"}],"materials":[{"name":"surface",'
+        b'"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},"doubleSided":true}],'
+        b'"meshes":[{"name":"surface","primitives":[{"attributes":{"POSITION":0},"indices":1,'
         b'"material":0}]}],"buffers":[{"byteLength":48}],"bufferViews":[{"buffer":0,"byteOffset":0,'
         b'"byteLength":36,"target":34962,"byteStride":12},{"buffer":0,"byteOffset":36,"byteLength":12,'
         b'"target":34963}],"accessors":[{"bufferView":0,"count":3,"componentType":5126,"type":"VEC3",'
