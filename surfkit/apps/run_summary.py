@@ -208,6 +208,8 @@ def _finishing_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
     if closing := record.get("closing"):
         holes, skirts, dropped = (f"{closing[name]:,}" for name in ("holes", "skirts", "dropped"))
         rows.append(("closed", f"{holes} holes filled, {skirts} parts on a base, {dropped} loose parts left out"))
+        if "bodies" in closing:  # not in those of earlier versions
+            rows.append(("bodies", f"{closing['bodies']:,}"))
     if simplification := record.get("simplification"):
         rows.append(("simplified from", f"{simplification['triangles_before']:,} triangles"))
     return rows

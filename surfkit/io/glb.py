@@ -92,11 +92,12 @@ def glb(where: str | Path, document: dict[str, Any], blocks: GlbWriter, remedy: 
 
     Raises:
         BadInput: More than 4 GiB; before anything else.
+        ValueError: A number that is written is NaN or Inf, which glTF forbids: what calls this is wrong.
     """
     if blocks.views:
         buffers = {"buffers": [{"byteLength": blocks.length}], "bufferViews": blocks.views}
         document = {**document, **buffers, "accessors": blocks.accessors}
-    text = json.dumps(document, separators=(",", ":")).encode()
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + (8 + blocks.length if blocks.views else 0)
     if total > MAX_GLB_BYTES:
@@ -104,9 +105,14 @@ def glb(where: str | Path, document: dict[str, Any], blocks: GlbWriter, remedy: 
     yield struct.pack("<4sII", GLB_MAGIC, 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
     if blocks.views:
         yield struct.pack("<I4s", blocks.length, b"BIN\0")
-    for view, make in zip(blocks.views, blocks.makers, strict=True):
+    floats = {
+        about["bufferView"] for about in blocks.accessors if about["componentType"] == FLOAT and "bufferView" in about
+    }
+    for at, (view, make) in enumerate(zip(blocks.views, blocks.makers, strict=True)):
         data = make()
         assert len(data) == view["byteLength"]
+        if at in floats and not np.isfinite(np.frombuffer(data, "<f4")).all():
+            raise ValueError(f"{where}: bufferViews[{at}] would have NaN or Inf, which glTF forbids")
         yield data + b"\0" * (-len(data) % 4)
 
 

@@ -81,15 +81,15 @@ def clean(
         raise BadInput(f"no triangle of the mesh is left: {what}")
     mesh = _referenced(mesh)  # those of what was dropped are neither finite nor near
     labels, sizes = clusters(mesh, gap)
-    large = _large(sizes, most, least)
+    large = large_enough(sizes, most, least)
     mesh, clustered = _keep(mesh, large[labels])
     mesh, closed = close_holes(_referenced(mesh), hole_edges)
     dropped = (not_finite, degenerate, cropped, len(sizes), int(large.sum()), clustered)
     return mesh, CleaningReport(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh), closed)
 
 
-def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:
-    """(C,) which clusters stay."""
+def large_enough(sizes: np.ndarray, most: int, least: int) -> np.ndarray:
+    """(C,) which clusters of so many triangles stay; see `clean`."""
     ranked = np.sort(sizes)[::-1]
     bound = max(least, ranked[most - 1] if len(sizes) >= most else 0)
     return sizes >= min(bound, ranked[0])

@@ -14,6 +14,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.clean import large_enough
 from surfkit.mesh.holes import areas_of, edges, fill, rings
 from surfkit.mesh.manifold import apart, separated
 from surfkit.mesh.shade import OPEN_GROUND_SHARE
@@ -39,9 +40,11 @@ class Closing:
         largest_hole: Edges of the largest of them.
         skirts: Parts of open ground that got walls and a base.
         base: Height of the base along the direction that is up, local units; None without skirts.
-        dropped: Parts that were left out: small open ones, and those that enclose nothing or are inside out.
+        dropped: Parts that were left out: small open ones, small bodies, and those that enclose nothing or are inside
+            out.
         dropped_triangles: That these had.
-        volume: That is enclosed, local units cubed.
+        bodies: Closed parts that are left.
+        volume: That these enclose, local units cubed.
     """
 
     cut: int
@@ -51,10 +54,15 @@ class Closing:
     base: float | None
     dropped: int
     dropped_triangles: int
-    volume: float
+    bodies: int = 0
+    volume: float = 0.0
 
 
-def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
+UNCHANGED = Closing(0, 0, 0, 0, None, 0, 0)
+"""Of a mesh that was closed before."""
+
+
+def closed(mesh: Mesh, up: np.ndarray, most: int | None = None, least: int = 1) -> tuple[Mesh, Closing]:
     """The mesh, closed, and what was done.
 
     What is added has the colours of its rim, no views, and an error that is not known (NaN).
@@ -62,6 +70,8 @@ def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
     Args:
         mesh: Welded, without triangles that have no area.
         up: (3,) unit vector, local frame.
+        most: Bodies that are kept; see `clean`. None: all.
+        least: Triangles that a body must have to stay.
 
     Raises:
         BadInput: It cannot be closed, or encloses nothing; there are no compiled kernels.
@@ -81,11 +91,11 @@ def closed(mesh: Mesh, up: np.ndarray) -> tuple[Mesh, Closing]:
         across = mesh.vertices.astype(np.float64) - heights[:, None] * up
         base = float(heights.min() - BASE_MARGIN_SHARE * np.ptp(across, axis=0).max())
         mesh = _on_base(mesh, rims, up, base)
-    mesh, empty, volume = _enclosing(mesh)
-    dropped = scraps[0] + empty[0], scraps[1] + empty[1]
-    mesh = apart(mesh)
+    closing = Closing(cut, len(holes), max(map(len, holes), default=0), len(rims), base, *scraps)
+    mesh, closing = bodies_of(mesh, closing, most, least)
+    mesh, closing = bodies_of(apart(mesh), closing)
     require_closed(mesh)
-    return mesh, Closing(cut, len(holes), max(map(len, holes), default=0), len(rims), base, *dropped, volume)
+    return mesh, closing
 
 
 def require_closed(mesh: Mesh, name: str = "the mesh") -> None:
@@ -288,14 +298,25 @@ def _on_base(mesh: Mesh, rims: list[np.ndarray], up: np.ndarray, base: float) ->
     return replace(mesh, faces=np.concatenate(faces).astype(np.int32))
 
 
-def _enclosing(mesh: Mesh) -> tuple[Mesh, tuple[int, int], float]:
-    """The parts of a closed mesh that enclose something, how many parts and triangles others were, and the volume."""
-    parts = _part_of_vertices(mesh)[mesh.faces[:, 0]]
+def bodies_of(mesh: Mesh, closing: Closing, most: int | None = None, least: int = 1) -> tuple[Mesh, Closing]:
+    """The bodies of a closed mesh that enclose something, and what was done to it, with these and those left out.
+
+    Of more and smaller bodies than wanted, see `closed`, those stay that `clean` would keep, and the one that encloses
+    most. Moving vertices, as simplification does, may turn a small body inside out.
+
+    Raises:
+        BadInput: None encloses anything.
+    """
+    parts = np.unique(_part_of_vertices(mesh)[mesh.faces[:, 0]], return_inverse=True)[1]
+    sizes = np.bincount(parts)
     middle = mesh.vertices.mean(0, dtype=np.float64)
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] - middle for corner in range(3))
     volumes = np.bincount(parts, (a * np.cross(b, c)).sum(1)) / 6
     stays = volumes > 0
     if not stays.any():
         raise BadInput("the mesh cannot be closed: none of its parts encloses anything")
-    gone = int((~stays).sum()), int((~stays[parts]).sum())
-    return _of_faces(mesh, stays[parts]), gone, float(volumes[stays].sum())
+    stays[stays] = large_enough(sizes[stays], len(sizes) if most is None else most, least)
+    stays[volumes.argmax()] = True
+    dropped = closing.dropped + int((~stays).sum()), closing.dropped_triangles + int(sizes[~stays].sum())
+    told = replace(closing, dropped=dropped[0], dropped_triangles=dropped[1], bodies=int(stays.sum()))
+    return _of_faces(mesh, stays[parts]), replace(told, volume=float(volumes[stays].sum()))

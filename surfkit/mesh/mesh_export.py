@@ -21,8 +21,14 @@ from surfkit.scene.scene import Frame
 Format = Literal["ply", "obj", "glb"]
 BATCH_ROWS = 1 << 20
 """Rows that are written at once."""
+SURFACE = "surface"
+"""Name of node, mesh and material in GLB: programs that open a file list them."""
 GLTF_UP_MATRIX = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
 """By columns, z up to y up, as glTF has it."""
+OBJ_COLORS = np.ceil(np.arange(256) / 255 * 1e6) / 1e6
+"""Bytes of colours as OBJ has them: rounded up, as some programs, MeshLab among them, cut off when they make bytes."""
+GLB_UNKNOWN = -1.0
+"""A value of a vertex that is not known, in GLB: glTF forbids NaN, and no value is below 0."""
 
 
 def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
@@ -69,8 +75,8 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
         rows = frame.to_file(mesh.vertices[at : at + BATCH_ROWS])
         line = f"v {place}\n"
         if mesh.colors is not None:
-            rows = np.concatenate([rows, mesh.colors[at : at + BATCH_ROWS] / 255], axis=1)
-            line = f"v {place} %.4f %.4f %.4f\n"
+            rows = np.concatenate([rows, OBJ_COLORS[mesh.colors[at : at + BATCH_ROWS]]], axis=1)
+            line = f"v {place} %.6f %.6f %.6f\n"
         file.write("".join([line % tuple(row) for row in rows.tolist()]).encode())
     for at in range(0, len(mesh.faces), BATCH_ROWS):
         rows = (mesh.faces[at : at + BATCH_ROWS] + 1).tolist()
@@ -80,7 +86,8 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     """GLB, and NAME.glb.json, which names the offset. Colours are linear, as glTF has them.
 
-    Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore.
+    Values of the vertices are attributes of their own, _VIEWS and _ERROR: glTF 2.0 asks for the underscore. Those that
+    are not known are `GLB_UNKNOWN`.
 
     Raises:
         BadInput: More than 4 GiB.
@@ -101,15 +108,22 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
         about = {"componentType": UNSIGNED_SHORT, "normalized": True, "type": "VEC4"}
         attributes["COLOR_0"] = blocks.accessor(view, count=count, **about)
     for name, each in in_files(mesh, frame).items():
-        view = blocks.add(4 * count, each.tobytes, target=VERTICES, byteStride=4)
+        known = np.where(np.isfinite(each), each, np.float32(GLB_UNKNOWN))
+        view = blocks.add(4 * count, known.tobytes, target=VERTICES, byteStride=4)
         attributes[f"_{name.upper()}"] = blocks.accessor(view, count=count, componentType=FLOAT, type="SCALAR")
     document = {
         "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | ({"matrix": GLTF_UP_MATRIX} if frame.crs else {})],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "nodes": [{"mesh": 0, "name": SURFACE} | ({"matrix": GLTF_UP_MATRIX} if frame.crs else {})],
+        "materials": [
+            {
+                "name": SURFACE,
+                "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+                "doubleSided": True,
+            }
+        ],
+        "meshes": [{"name": SURFACE, "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
     }
     write_glb(path, document, blocks, "simplify the mesh, with --triangles")
     beside = Path(f"{path}.json")

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.folds import unfolded
 from surfkit.raster.native import kernels, lacking, module
 
 COLLAPSE_COST_FACTOR = 6.0
@@ -86,7 +87,8 @@ def simplify_to(mesh: Mesh, count: int) -> Mesh:
     """The mesh with at most `count` triangles, by quadric error (Garland and Heckbert 1997, in fast-simplification).
 
     It is for meshes of any size: 10 million triangles take half a minute and 3 GB. A vertex gets the mean colour of
-    those that it stands for.
+    those that it stands for. Where it lays triangles on one another, or makes edges of three, some are left out: see
+    `unfolded`.
 
     Raises:
         BadInput: fast-simplification cannot be loaded.
@@ -102,8 +104,10 @@ def simplify_to(mesh: Mesh, count: int) -> Mesh:
     places, faces = reduced((mesh.vertices - middle) * unit, mesh.faces, target_count=count)
     used, corners = np.unique(faces, return_inverse=True)
     vertices = (places[used] / unit + middle).astype(np.float32)
-    found = replace(mesh, vertices=vertices, faces=corners.reshape(-1, 3).astype(np.int32), colors=None)
-    return found if mesh.colors is None else replace(found, colors=_mean_colors(mesh.vertices, mesh.colors, vertices))
+    found = unfolded(Mesh(vertices, corners.reshape(-1, 3).astype(np.int32), facts=mesh.facts), mesh)
+    if mesh.colors is None:
+        return found
+    return replace(found, colors=_mean_colors(mesh.vertices, mesh.colors, found.vertices))
 
 
 def _mean_edge(mesh: Mesh) -> float:

@@ -21,7 +21,7 @@ from surfkit.io.datasets.depth_prior import read_priors
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
 from surfkit.mesh.clean import CleaningReport, clean
-from surfkit.mesh.closed import closed, require_closed
+from surfkit.mesh.closed import UNCHANGED, bodies_of, closed, require_closed
 from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.manifold import apart
 from surfkit.mesh.mesh_export import write_mesh
@@ -183,27 +183,30 @@ def finished(mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> tuple[Mesh
         BadInput: It cannot be closed.
     """
     done: dict[str, Any] = {}
-    frame = subject.frame
+    frame, closing = subject.frame, None
     if delivery.watertight:
         emit(Progress("closing", 0, 1))
         up = upright(mesh, subject)
-        mesh, closing = closed(mesh, up)
+        mesh, closing = closed(mesh, up, delivery.clusters, delivery.least_triangles)
         emit(Progress("closing", 1, 1))
         base = None if closing.base is None else float(frame.to_input(closing.base * up) @ up)
-        done["closing"] = dump(closing) | {"base": base, "volume": closing.volume / frame.scale**3}
+        done["closing"] = {"base": base}
     if delivery.triangles is not None or delivery.error is not None:
         emit(Progress("simplifying", 0, 1))
         before, error = len(mesh.faces), delivery.error
         if error is not None:
             error = error * frame.scale if frame.local_metres is None else error / frame.local_metres
         mesh = simplified(mesh, delivery.triangles, error)
-        mesh = apart(mesh) if delivery.watertight else mesh
+        if closing is not None:
+            mesh, closing = bodies_of(apart(mesh), closing)
         emit(Progress("simplifying", 1, 1))
         done["simplification"] = {"triangles_before": before, "triangles": len(mesh.faces)}
         if delivery.triangles is not None and len(mesh.faces) > delivery.triangles:
             why = "its parts and holes need them; --cluster-gap 0 and --hole-edges leave fewer of these"
             why = why if delivery.error is None else "fewer would move it farther than --error"
             emit(Warned(f"--triangles {delivery.triangles}: {len(mesh.faces):,} are left, as {why}"))
+    if closing is not None:  # of what is written
+        done["closing"] = dump(closing) | done["closing"] | {"volume": closing.volume / frame.scale**3}
     return mesh, done
 
 
@@ -223,7 +226,7 @@ def levels(mesh: Mesh, delivery: MeshOutput, frame: Frame) -> list[tuple[str, Me
     meshes = [("mesh", mesh)]
     for at, share in enumerate(delivery.lods, 1):
         less = simplified(mesh, max(1, round(share * len(mesh.faces))))
-        meshes.append((f"mesh-lod{at}", apart(less) if delivery.watertight else less))
+        meshes.append((f"mesh-lod{at}", bodies_of(apart(less), UNCHANGED)[0] if delivery.watertight else less))
         emit(Progress("simplifying", at, len(delivery.lods)))
     for name, each in meshes if delivery.watertight else ():
         require_closed(each, name)

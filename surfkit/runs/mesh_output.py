@@ -38,7 +38,8 @@ class MeshOutput:
 
     watertight: bool = False
     """Close the mesh, for printing and simulation: each edge gets two triangles. Holes are filled; open ground gets
-    walls and a flat base. Small loose sheets are left out."""
+    walls and a flat base. Small loose sheets are left out, and so are small bodies, by `--clusters` and
+    `--least-triangles`."""
 
     clusters: int = 50
     """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""

@@ -115,6 +115,25 @@ def test_what_encloses_nothing_goes():
         closed(inside_out, UP)
 
 
+def test_small_bodies_go_and_the_largest_stay():
+    """By triangles as in cleaning, but that which encloses most stays, were it a box."""
+    box = as_mesh(trimesh.creation.box((3, 3, 3)))
+    balls = [as_mesh(trimesh.creation.icosphere(divisions)) for divisions in (3, 3, 2, 1, 1)]
+    apart_by = [Mesh(0.3 * each.vertices + np.float32([4 * at + 4, 0, 0]), each.faces) for at, each in enumerate(balls)]
+    whole = joined(box, *apart_by)
+    cases = {(None, 1): 6, (None, 81): 4, (None, 321): 3, (2, 1): 3, (1, 1): 3, (50, 10_000): 3, (3, 1): 4}
+    for (most, least), bodies in cases.items():
+        mesh, done = closed(whole, UP, most, least)
+        found = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert (done.bodies, done.dropped, done.dropped_triangles) == (
+            bodies,
+            6 - bodies,
+            len(whole.faces) - len(mesh.faces),
+        )
+        assert done.bodies == found.body_count and done.volume == pytest.approx(found.volume, rel=1e-4)
+        assert found.volume > 27
+
+
 def test_triangles_that_are_turned_are_closed_too(tmp_path, rng=np.random.default_rng(1)):
     """Where neighbours pass an edge the same way, there is an open edge for each; and what is random may be crowded."""
     ball = as_mesh(trimesh.creation.icosphere(2))

@@ -11,6 +11,7 @@ from needs import needs
 from surfkit.apps.view.viewer_scene import local_mesh
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.io.glb import FLOAT, GlbWriter, write_glb
 from surfkit.mesh.base import Mesh, require_values
 from surfkit.mesh.mesh_export import write_mesh
 from surfkit.mesh.simplify import simplify_to
@@ -39,8 +40,20 @@ def test_coordinates_are_those_of_the_input_to_a_tenth_of_a_millimetre(tmp_path,
     read = trimesh.load(path, process=False, maintain_order=True)
     assert np.abs(read.vertices + SHIFT - UTM.to_input(mesh.vertices)).max() < 1e-4
     assert np.array_equal(read.faces, mesh.faces)
-    assert np.abs(colors_of(read).astype(int) - mesh.colors).max() <= (1 if kind == "obj" else 0)
+    assert np.array_equal(colors_of(read), mesh.colors)
     assert b"EPSG:32632" in path.read_bytes()[:300]
+
+
+def test_colours_of_obj_are_the_same_bytes_rounded_or_cut_off(tmp_path):
+    """MeshLab cuts off what Blender rounds, in 32 bits."""
+    colors = np.repeat(np.arange(256, dtype=np.uint8)[:, None], 3, axis=1)
+    places = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
+    write_mesh(tmp_path / "mesh.obj", Mesh(places, np.array([[0, 1, 2]], np.int32), colors), UTM)
+    lines = [line.split()[4:] for line in (tmp_path / "mesh.obj").read_text().splitlines() if line.startswith("v ")]
+    for kind in (np.float32, np.float64):
+        found = np.array(lines, kind) * kind(255)
+        assert np.array_equal(np.floor(found), colors) and np.array_equal(np.rint(found), colors)
+        assert found.max() == 255
 
 
 def test_glb_has_an_offset_beside_it(tmp_path):
@@ -167,8 +180,9 @@ def test_a_glb_file_byte_for_byte(tmp_path, monkeypatch):
     write_mesh(path, Mesh(corners, np.array([[0, 1, 2]], np.int32)), Frame(np.zeros(3), 1.0))
     text = (
         b'{"asset":{"version":"2.0","generator":"surfkit 1.2.3"},"scene":0,"scenes":[{"nodes":[0]}],'
-        b'"nodes":[{"mesh":0}],"materials":[{"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},'
-        b'"doubleSided":true}],"meshes":[{"primitives":[{"attributes":{"POSITION":0},"indices":1,'
+        b'"nodes":[{"mesh":0,"name":"surface"}],"materials":[{"name":"surface",'
+        b'"pbrMetallicRoughness":{"metallicFactor":0,"roughnessFactor":1},"doubleSided":true}],'
+        b'"meshes":[{"name":"surface","primitives":[{"attributes":{"POSITION":0},"indices":1,'
         b'"material":0}]}],"buffers":[{"byteLength":48}],"bufferViews":[{"buffer":0,"byteOffset":0,'
         b'"byteLength":36,"target":34962,"byteStride":12},{"buffer":0,"byteOffset":36,"byteLength":12,'
         b'"target":34963}],"accessors":[{"bufferView":0,"count":3,"componentType":5126,"type":"VEC3",'
@@ -200,6 +214,34 @@ def test_values_are_attributes_of_glb(tmp_path):
     (read,) = trimesh.load(path, process=False).geometry.values()
     assert np.array_equal(np.ravel(read.vertex_attributes["_VIEWS"]), mesh.values["views"])
     assert np.array_equal(read.faces, mesh.faces) and "color" in read.visual.vertex_attributes
+
+
+def test_what_is_not_known_is_below_zero_in_glb_and_nan_in_ply(tmp_path):
+    """glTF 2.0, 3.6.2.1: an accessor has no NaN and no Inf."""
+    mesh = with_values()
+    mesh.values["error"][::3] = np.nan
+    mesh.values["error"][1] = np.inf
+    wanted = np.where(np.isfinite(mesh.values["error"]), mesh.values["error"] / np.float32(0.01), -1)
+    write_mesh(tmp_path / "mesh.glb", mesh, UTM)
+    (read,) = trimesh.load(tmp_path / "mesh.glb", process=False).geometry.values()
+    assert np.ravel(read.vertex_attributes["_ERROR"]) == pytest.approx(wanted, rel=1e-6)
+    write_mesh(tmp_path / "mesh.ply", mesh, UTM)
+    assert np.isnan(read_surface(tmp_path / "mesh.ply").rows["error"][::3]).all()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_glb_file_that_would_not_be_valid_is_not_written(tmp_path, wrong):
+    """Of the corners, the ends in the JSON show it; of other numbers, the bytes."""
+    places = ball().vertices.copy()
+    places[5, 1] = wrong
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_mesh(tmp_path / "mesh.glb", replace(ball(), vertices=places), Frame(np.zeros(3), 1.0))
+    blocks = GlbWriter()
+    numbers = np.array([1, wrong, 2], "<f4")
+    blocks.accessor(blocks.add(12, numbers.tobytes), count=3, componentType=FLOAT, type="SCALAR")
+    with pytest.raises(ValueError, match=r"bad\.glb: bufferViews\[0\] would have NaN or Inf"):
+        write_glb(tmp_path / "bad.glb", {}, blocks, "")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["ply", "glb", "obj"])

@@ -120,6 +120,44 @@ def test_a_slab_cut_by_a_triangle_with_a_hole(tmp_path, crs):
     assert report.cropped == len(mesh.faces) - len(found.faces)
 
 
+def balls(*divisions):
+    """Balls beside each other, of 20, 80, 320 triangles and so on."""
+    trimesh = needs("trimesh")
+    found = trimesh.util.concatenate(
+        [trimesh.creation.icosphere(each).apply_translation([3 * at, 0, 0]) for at, each in enumerate(divisions)]
+    )
+    return Mesh(found.vertices.astype(np.float32), found.faces.astype(np.int32))
+
+
+def solid_of(mesh, scale):
+    return needs("trimesh").Trimesh(mesh.vertices / scale, mesh.faces, process=False)
+
+
+def test_what_is_told_of_a_closed_mesh_is_true_of_the_one_that_is_written(monkeypatch):
+    """Its volume is less once it has fewer triangles; of three balls the smallest goes."""
+    monkeypatch.setattr(delivering, "upright", lambda mesh, subject: np.array([0.0, 0.0, 1.0]))
+    subject = SimpleNamespace(frame=Frame(np.zeros(3), 0.1), views=())
+    delivery = MeshOutput(watertight=True, triangles=100, lods=(0.5,))
+    mesh, done = finished(balls(3, 3, 0), delivery, subject)
+    solid, told = solid_of(mesh, 0.1), done["closing"]
+    assert told["volume"] == pytest.approx(solid.volume, rel=1e-5) and solid.volume < 2 * 4.1e3
+    assert (told["bodies"], told["dropped"], told["dropped_triangles"]) == (solid.body_count, 1, 20) == (2, 1, 20)
+    assert done["simplification"] == {"triangles_before": 2560, "triangles": len(mesh.faces)}
+
+    def turning(mesh, most, error=None):  # the last body, as simplifying a thin one may
+        faces = mesh.faces.copy()
+        faces[-1280:] = faces[-1280:, ::-1]
+        return Mesh(mesh.vertices, faces)
+
+    monkeypatch.setattr(delivering, "simplified", turning)
+    mesh, done = finished(balls(3, 3, 0), delivery, subject)
+    told = done["closing"]
+    assert (told["bodies"], told["dropped"], told["dropped_triangles"], len(mesh.faces)) == (1, 2, 1300, 1280)
+    assert done["simplification"]["triangles"] == 1280
+    level = levels(balls(3, 3), delivery, subject.frame)[1][1]
+    assert len(level.faces) == 1280 and solid_of(level, 0.1).volume > 0
+
+
 def test_a_level_that_would_not_be_closed_is_refused():
     with pytest.raises(BadInput, match="mesh cannot be closed: 3 "):
         levels(TRIANGLE, MeshOutput(watertight=True), Frame(np.zeros(3), 1.0))

@@ -23,6 +23,8 @@ from surfkit.mesh.base import Mesh
 BATCH_ROWS = 1 << 20
 """Rows that are written at once."""
 LINEAR, MIPMAPS, CLAMP = 9729, 9987, 33071
+NAME = "textured surface"
+"""Of the node and the mesh in GLB: programs that open a file list them."""
 SUFFIX = {"jpeg": "jpg", "png": "png"}
 
 Place = Callable[[np.ndarray], np.ndarray]
@@ -128,10 +130,13 @@ def write_textured_glb(
         xyz = place(mesh.vertices[part.vertices]).astype("<f4")
         corners += [xyz.min(0), xyz.max(0)]
         primitives.append({**_add_part(blocks, xyz, part), "material": at})
-        images.append({"bufferView": blocks.add(page.stat().st_size, page.read_bytes), "mimeType": f"image/{kind}"})
+        view = blocks.add(page.stat().st_size, page.read_bytes)
+        images.append({"name": f"texture {at}", "bufferView": view, "mimeType": f"image/{kind}"})
     matrix = np.eye(4)
     matrix[:3, :3] = turn
-    node = {"mesh": 0} | ({} if np.array_equal(turn, np.eye(3)) else {"matrix": matrix.T.ravel().tolist()})
+    node = {"mesh": 0, "name": NAME} | (
+        {} if np.array_equal(turn, np.eye(3)) else {"matrix": matrix.T.ravel().tolist()}
+    )
     extras = {"extras": {"surfkit": notes}} if notes else {}
     document = {
         "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"} | extras,
@@ -139,7 +144,7 @@ def write_textured_glb(
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": primitives}],
+        "meshes": [{"name": NAME, "primitives": primitives}],
         "materials": [_material(at) for at in range(len(parts))],
         "textures": [{"sampler": 0, "source": at} for at in range(len(parts))],
         "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP}],
@@ -165,6 +170,7 @@ def _add_part(blocks: GlbWriter, xyz: np.ndarray, part: AtlasPageMesh) -> dict[s
 def _material(texture: int) -> dict[str, Any]:
     """Shows a texture as it is, from both sides."""
     return {
+        "name": f"texture {texture}",
         "pbrMetallicRoughness": {"baseColorTexture": {"index": texture}, "metallicFactor": 0, "roughnessFactor": 1},
         "extensions": {UNLIT: {}},
         "doubleSided": True,

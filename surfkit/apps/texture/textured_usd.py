@@ -52,12 +52,13 @@ def write_textured_usdz(
     matrix[:3, :3] = turn
     place_prim(root, matrix)
     for number, (part, page) in enumerate(zip(parts, pages, strict=True)):
-        _add_part(stage, f"{ROOT}/page{number}", place(mesh.vertices[part.vertices]), part, page.name)
+        places = place(mesh.vertices[part.vertices])
+        _add_part(stage, f"{ROOT}/page{number}", places, part, page.name, f"texture_{number}")
     write_usdz(path, stage, pages)
 
 
-def _add_part(stage: Any, path: str, places: np.ndarray, part: AtlasPageMesh, texture: str) -> None:
-    """The mesh of a page with (V, 3) coordinates of its vertices, and its material."""
+def _add_part(stage: Any, path: str, places: np.ndarray, part: AtlasPageMesh, texture: str, name: str) -> None:
+    """The mesh of a page with (V, 3) coordinates of its vertices, and its material, which has a name of its own."""
     from pxr import Sdf, UsdGeom, UsdShade, Vt
 
     points = np.ascontiguousarray(places, np.float32)
@@ -72,20 +73,20 @@ def _add_part(stage: Any, path: str, places: np.ndarray, part: AtlasPageMesh, te
     uv = UsdGeom.PrimvarsAPI(made).CreatePrimvar("st", kind.TexCoord2fArray, UsdGeom.Tokens.vertex)
     uv.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(part.uv * [1, -1] + [0, 1], np.float32)))
 
-    material = UsdShade.Material.Define(stage, f"{path}/material")
+    material = UsdShade.Material.Define(stage, f"{path}/{name}")
     surface, reader, image = (
-        UsdShade.Shader.Define(stage, f"{path}/material/{name}") for name in ("surface", "reader", "image")
+        UsdShade.Shader.Define(stage, f"{path}/{name}/{each}") for each in ("surface", "reader", "image")
     )
-    for shader, name in ((surface, "UsdPreviewSurface"), (reader, "UsdPrimvarReader_float2"), (image, "UsdUVTexture")):
-        shader.CreateIdAttr(name)
+    for shader, what in ((surface, "UsdPreviewSurface"), (reader, "UsdPrimvarReader_float2"), (image, "UsdUVTexture")):
+        shader.CreateIdAttr(what)
     reader.CreateInput("varname", kind.String).Set("st")
-    for name, type_name, value in (
+    for key, type_name, value in (
         ("file", kind.Asset, texture),
         ("sourceColorSpace", kind.Token, "sRGB"),
         ("wrapS", kind.Token, "clamp"),
         ("wrapT", kind.Token, "clamp"),
     ):
-        image.CreateInput(name, type_name).Set(value)
+        image.CreateInput(key, type_name).Set(value)
     image.CreateInput("st", kind.Float2).ConnectToSource(reader.CreateOutput("result", kind.Float2))
     color = surface.CreateInput("diffuseColor", kind.Color3f)
     color.ConnectToSource(image.CreateOutput("rgb", kind.Float3))

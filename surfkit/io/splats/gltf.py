@@ -116,7 +116,7 @@ def write_splats(path: Path, table: SplatTable, turn: np.ndarray, compress: Comp
         document["scenes"] = [{"nodes": [0]}]
         document["nodes"] = [{"mesh": 0, "name": "splats"} | ({} if plain else {"matrix": matrix.T.ravel().tolist()})]
         primitive = (_compressed if compress == "spz" else _plain)(path, blocks, table)
-        document["meshes"] = [{"primitives": [{"mode": 0, **primitive}]}]
+        document["meshes"] = [{"name": "splats", "primitives": [{"mode": 0, **primitive}]}]
         document["extensionsUsed"] = extensions_of(compress)
         if compress == "spz":
             document["extensionsRequired"] = extensions_of(compress)

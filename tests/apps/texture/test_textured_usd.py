@@ -13,6 +13,7 @@ from town import town
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos, TextureSettings, make_texture
 from surfkit.cli import main
 from surfkit.core.events import Warned
+from surfkit.io.glb import read_glb
 
 needs("fast_simplification")
 trimesh = needs("trimesh")
@@ -72,8 +73,10 @@ def test_each_page_shows_its_picture(files):
     archive = zipfile.ZipFile(files[0] / "textured.usdz")
     scene = trimesh.load(files[0] / "textured.glb", process=False, force="scene")
     assert archive.namelist()[0] == "scene.usdc" and {each.compress_type for each in archive.infolist()} == {0}
+    names = []
     for page, known in zip(pages(stage), scene.geometry.values(), strict=True):
         material, _ = UsdShade.MaterialBindingAPI(page).ComputeBoundMaterial()
+        names.append((material.GetPrim().GetName(), known.visual.material.name))
         surface, _, _ = material.ComputeSurfaceSource()
         (source,), _ = surface.GetInput("diffuseColor").GetConnectedSources()
         image = UsdShade.Shader(source.source)
@@ -82,6 +85,10 @@ def test_each_page_shows_its_picture(files):
         assert asset.resolvedPath.endswith(f"[{asset.path}]"), "it is found in the archive"
         picture = Image.open(io.BytesIO(archive.read(asset.path)))
         assert np.array_equal(picture.convert("RGB"), known.visual.material.baseColorTexture.convert("RGB"))
+    assert names == [(f"texture_{at}", f"texture {at}") for at in range(len(names))] and len(names) > 1
+    root = read_glb(files[0] / "textured.glb").root
+    assert {root[kind][0]["name"] for kind in ("nodes", "meshes")} == {"textured surface"}
+    assert [image["name"] for image in root["images"]] == [f"texture {at}" for at in range(len(names))]
 
 
 def test_too_large_for_an_archive(tmp_path, monkeypatch):

@@ -122,6 +122,7 @@ def test_one_splat_is_written_as_computed_by_hand(tmp_path):
             first = next(at)
             assert found.pop(f"{SPLATS}:SH_DEGREE_{degree}_COEF_{order}").tolist() == [[first, first + 1, first + 2]]
     assert not found
+    assert document["nodes"][0]["name"] == document["meshes"][0]["name"] == "splats"
     primitive, position = document["meshes"][0]["primitives"][0], document["accessors"][0]
     assert primitive["mode"] == 0 and position["min"] == position["max"] == [1, 2, 3]
     assert primitive["extensions"] == {
