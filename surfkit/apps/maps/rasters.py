@@ -20,12 +20,17 @@ TILE_SIDE_CELLS = 512
 """Side of the tiles within a file, cells."""
 NODATA = -9999.0
 """Height where there is no surface."""
-Kind = Literal["heights", "colors", "shades", "numbers"]
+NO_COUNT = 65535
+"""Count where there is no surface: 0 is a count."""
+Kind = Literal["heights", "colors", "shades", "numbers", "counts"]
+GDAL_TYPES = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint16": "UInt16", "uint32": "UInt32"}
+"""Names of types of cells."""
 CHANNELS = {
     "heights": ("Gray",),
     "colors": ("Red", "Green", "Blue", "Alpha"),
     "shades": ("Gray",),
     "numbers": ("Gray",),
+    "counts": ("Gray",),
 }
 BANDS = {
     "dsm.tif": ("height of the surface", True),
@@ -40,6 +45,8 @@ BANDS = {
     "orthophoto-photographs.tif": ("number of the photograph", False),
 }
 """What the band of a file has, and whether it is a length in the unit of the map."""
+COUNTS = {"rays.tif"}
+"""Files of whole numbers from 0 on, with NODATA where there is no surface when they are drawn."""
 HEIGHTS = {"dsm.tif", "dsm-other.tif", "dtm.tif"}
 """Files of heights above the datum: no other one names it, as GDAL takes bands without a unit for heights in that of
 the datum, and gdalwarp shifts what names it by the geoid, were it a difference or a picture."""
@@ -74,13 +81,13 @@ class Raster:
     @property
     def dtype(self) -> str:
         """Of the cells."""
-        kinds = {"heights": "float64" if self.double else "float32", "numbers": "uint32"}
+        kinds = {"heights": "float64" if self.double else "float32", "numbers": "uint32", "counts": "uint16"}
         return kinds.get(self.kind, "uint8")
 
     @property
     def nodata(self) -> float | None:
         """What cells without a surface have; None where a channel says it."""
-        return {"heights": NODATA, "colors": None, "shades": 0, "numbers": 0}[self.kind]
+        return {"heights": NODATA, "colors": None, "shades": 0, "numbers": 0, "counts": NO_COUNT}[self.kind]
 
     @property
     def system(self) -> Any:
@@ -100,6 +107,8 @@ class Raster:
 
         gsd, west, north = self.grid.gsd, self.grid.west + window.left, self.grid.north - window.top
         place = {"crs": self.system, "transform": Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd)}
+        if self.kind == "counts":
+            image = np.where(image == NODATA, NO_COUNT, image.clip(0, NO_COUNT - 1))
         image = image.reshape(-1, window.height, window.width).astype(self.dtype, copy=False)
         inner = {
             "tiled": True,
@@ -136,7 +145,9 @@ class Raster:
         place = west, grid.gsd, 0.0, north, 0.0, -grid.gsd
         ElementTree.SubElement(root, "GeoTransform").text = ", ".join(map(repr, place))
         tiles = sorted(self.folder.glob("*.tif"))
-        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint32": "UInt32"}[self.dtype]
+        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint16": "UInt16", "uint32": "UInt32"}[
+            self.dtype
+        ]
         for channel, color in enumerate(CHANNELS[self.kind], 1):
             band = ElementTree.SubElement(root, "VRTRasterBand", dataType=kind, band=str(channel))
             if self.nodata is not None:
