@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +18,8 @@ EXTENT_FACTOR = 1.1
 """The scene extent is this times the largest distance of a training camera to their mean centre."""
 MAX_EXTENTS_OFFSET = 16
 """Beyond this many extents from 0, float32 coordinates would lose what is a millionth of the extent."""
+OFFSET_OF_SYSTEM = re.compile(r"(\S+ \S+ \S+) \(add it to x y z to get (.+)\)")
+"""An offset in the header of a file, and the coordinate reference system of the coordinates with it."""
 
 
 @dataclass(frozen=True)
@@ -154,11 +157,17 @@ class Frame:
 
     @property
     def comments(self) -> list[str]:
-        """What the header of a file in this frame says of it; no line where there is nothing to say."""
-        east, north, up = (f"{value:.15g}" for value in self.shift)
+        """What the header of a file in this frame says of it; no line where there is nothing to say.
+
+        MDAL, by which QGIS reads meshes, takes `crs: ...` for the system of the coordinates as they are in the file. So
+        where these leave out the offset, its line names the system, and no line begins with `crs:`.
+        """
+        offset = "offset: " + " ".join(f"{value:.15g}" for value in self.shift)
+        stated = [f"crs: {self.crs}"] if self.crs else []
+        if any(self.shift):
+            stated = [f"{offset} (add it to x y z to get {self.crs})" if self.crs else offset]
         return [
-            *([f"offset: {east} {north} {up}"] if any(self.shift) else []),
-            *([f"crs: {self.crs}"] if self.crs else []),
+            *stated,
             *([f"metres per unit: {self.metres:.15g}"] if self.metres else []),
         ]
 
@@ -204,6 +213,13 @@ class Scene:
     held_out: tuple[View, ...]
     cloud: SparsePoints
     frame: Frame
+
+
+def offset_of_comment(stated: str) -> tuple[str, str | None]:
+    """The three numbers of an offset as `Frame.comments` states it, and the coordinate reference system of coordinates
+    with it; None where that is not there."""
+    found = OFFSET_OF_SYSTEM.fullmatch(stated)
+    return (found[1], found[2]) if found else (stated, None)
 
 
 def _shift(origin: np.ndarray, extent: float) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ from needs import needs
 
 from surfkit.apps.view.viewer_scene import local_mesh
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.evaluate.geometry.surface_file import read_surface, system_of
 from surfkit.io.glb import FLOAT, GlbWriter, write_glb
 from surfkit.mesh.base import Mesh, require_values
 from surfkit.mesh.mesh_export import write_mesh
@@ -84,8 +84,17 @@ def test_all_files_leave_out_one_offset_and_name_it(tmp_path):
         found = read_surface(path).vertices()
         assert np.abs(found - UTM.to_input(mesh.vertices)).max() < 1e-3, kind
     heads = [(tmp_path / name).read_bytes()[:400].decode("ascii", "replace") for name in ("mesh.ply", "mesh.obj")]
-    assert f"\ncomment offset: {stated}\n" in heads[0] and f"\n# offset: {stated}\n" in heads[1]
+    told = f"offset: {stated} (add it to x y z to get EPSG:32632)"
+    assert f"\ncomment {told}\n" in heads[0] and f"\n# {told}\n" in heads[1]
+    assert "crs:" not in heads[0], "QGIS takes it for the system of coordinates as they are, at the equator"
+    assert system_of(tmp_path / "mesh.ply") == "EPSG:32632"
     assert json.loads((tmp_path / "mesh.glb.json").read_text())["offset"] == list(SHIFT)
+
+
+def test_without_an_offset_the_system_is_that_of_the_file(tmp_path):
+    write_mesh(tmp_path / "mesh.ply", ball(), Frame(np.zeros(3), 1.0, 1.0, "EPSG:32632"))
+    assert b"\ncomment crs: EPSG:32632\n" in (tmp_path / "mesh.ply").read_bytes()[:400]
+    assert system_of(tmp_path / "mesh.ply") == "EPSG:32632"
 
 
 def test_what_older_versions_wrote_is_read_as_it_is(tmp_path):

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from surfkit.apps.maps.geopackage import write_layer
 from surfkit.apps.maps.geotiff import TILES_SUFFIX, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.joined_lines import Line, joined, length_of
@@ -65,7 +66,6 @@ def write_contours(
             if not (tiles / f"{at}.npz").exists():
                 _keep(contour_lines(read_heights(model, part), grid, part, interval), tiles / f"{at}.npz")
             emit(Progress("contour lines", at + 1, len(windows)))
-    layer = {"layer": "contours", "driver": "GPKG", "geometry_type": "LineString", "crs": sheet.crs.to_wkt()}
     for rest in sheet.folder.glob(f"{name}*"):
         if rest != tiles:  # of an interrupted call
             rest.unlink()
@@ -76,22 +76,21 @@ def write_contours(
         short += len(found) - len(long)
         few += long
         if len(few) >= LINES_TOGETHER:
-            count += _append(few, path, layer)
+            count += _append(few, path, sheet.crs)
             few = []
     if few or not path.exists():
-        count += _append(few, path, layer)
+        count += _append(few, path, sheet.crs)
     sheet.deliver(path)
     return count, short
 
 
-def _append(lines: list[Line], path: Path, layer: dict[str, Any]) -> int:
+def _append(lines: list[Line], path: Path, crs: Any) -> int:
     """Write lines to those of a file, and return how many they are."""
     import shapely
-    from pyogrio.raw import write
 
     shapes = np.array([shapely.LineString(line).wkb for _, line in lines], object)
     levels = np.array([level for level, _ in lines], np.float64)
-    write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
+    write_layer(path, "contours", "LineString", crs, shapes, [levels], ["elevation"])
     return len(lines)
 
 

@@ -25,7 +25,7 @@ from surfkit.apps.maps.owned_files import (
     own_files,
     refuse_foreign,
 )
-from surfkit.apps.maps.rasters import TILE_SIDE_CELLS, Kind, Raster
+from surfkit.apps.maps.rasters import COUNTS, TILE_SIDE_CELLS, Kind, Raster
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
@@ -39,6 +39,8 @@ MIN_FREE_DISK_BYTES = 1 << 20
 """Bytes of a disk, below which it is full."""
 NOT_WRITTEN = re.compile("write (error|failed)|no space", re.IGNORECASE)
 """How GDAL says that a file could not be written."""
+RESAMPLING = {"numbers": "MODE", "counts": "NEAREST"}
+"""How overviews are made of kinds whose values have no mean: a half of a photograph confirms nothing."""
 TILES_SUFFIX = ".tiles"
 """Ending of the names of folders with the tiles of a raster."""
 
@@ -68,12 +70,14 @@ class GeoTiffSettings:
         """A raster to write tiles of, that becomes the Cloud Optimized GeoTIFF `name` in `out` when all went well.
 
         Heights have NODATA where there is nothing; colours have a fourth channel that is 0 there and 255 elsewhere;
-        shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits.
+        shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits. Counts (`COUNTS`) are 0 and more,
+        of 16 bits, whatever the kind is called, and NO_COUNT where there is nothing.
         """
         import rasterio
 
         folder = self.folder / f"{name}{TILES_SUFFIX}"
         folder.mkdir(exist_ok=True)
+        kind = "counts" if name in COUNTS else kind
         raster = Raster(folder, self.grid, self.crs, kind, self.double, name)
         with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
             yield raster
@@ -85,7 +89,7 @@ class GeoTiffSettings:
             "compress": "DEFLATE",
             "predictor": "YES",
             "overviews": "IGNORE_EXISTING",
-            "resampling": "MODE" if kind == "numbers" else "AVERAGE",
+            "resampling": RESAMPLING.get(kind, "AVERAGE"),
             "bigtiff": "IF_SAFER",
             "sparse_ok": True,
         }

@@ -26,7 +26,7 @@ COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
 SHORTEST_CELLS = 30
 """Length of the shortest contour line that is written without being asked for others, cells."""
-VOLUME_FILES = ("volumes", "volumes-table")
+VOLUME_FILES = ("volumes", "volumes-table", "volumes-types")
 """Files of volumes."""
 PRODUCT_PACKAGES = {"contours": ("pyogrio", "shapely"), "points": ("laspy", "lazrs")}
 VOLUME_OPTION = "--volume"

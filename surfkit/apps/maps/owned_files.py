@@ -18,7 +18,7 @@ PRODUCT_FILES = {
     "points": "points.copc.laz", "precision": "precision.tif", "rays": "rays.tif",
     "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
-    "volumes": "volumes.gpkg", "volumes-table": "volumes.csv",
+    "volumes": "volumes.gpkg", "volumes-table": "volumes.csv", "volumes-types": "volumes.csvt",
 }  # fmt: skip
 FORMER_FILES = {"points.laz"}
 """Files that earlier versions wrote; they are replaced with the rest."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -19,12 +20,17 @@ TILE_SIDE_CELLS = 512
 """Side of the tiles within a file, cells."""
 NODATA = -9999.0
 """Height where there is no surface."""
-Kind = Literal["heights", "colors", "shades", "numbers"]
+NO_COUNT = 65535
+"""Count where there is no surface: 0 is a count."""
+Kind = Literal["heights", "colors", "shades", "numbers", "counts"]
+GDAL_TYPES = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint16": "UInt16", "uint32": "UInt32"}
+"""Names of types of cells."""
 CHANNELS = {
     "heights": ("Gray",),
     "colors": ("Red", "Green", "Blue", "Alpha"),
     "shades": ("Gray",),
     "numbers": ("Gray",),
+    "counts": ("Gray",),
 }
 BANDS = {
     "dsm.tif": ("height of the surface", True),
@@ -39,8 +45,15 @@ BANDS = {
     "orthophoto-photographs.tif": ("number of the photograph", False),
 }
 """What the band of a file has, and whether it is a length in the unit of the map."""
+COUNTS = {"rays.tif"}
+"""Files of whole numbers from 0 on, with NODATA where there is no surface when they are drawn."""
+HEIGHTS = {"dsm.tif", "dsm-other.tif", "dtm.tif"}
+"""Files of heights above the datum: no other one names it, as GDAL takes bands without a unit for heights in that of
+the datum, and gdalwarp shifts what names it by the geoid, were it a difference or a picture."""
 LOCAL_UNIT = re.compile(r'^LOCAL_CS\[.*UNIT\["([^"]+)"', re.DOTALL)
 """Of a local system without a reference; "unit" is one of unknown or odd length."""
+UNKNOWN_UNIT = re.compile(r'^LOCAL_CS\[.*UNIT\["unit",1\]', re.DOTALL)
+"""Of a local system whose unit is of unknown length."""
 FACTS_TAG = "surfkit"
 """Tag of a tile for what was counted when it was drawn."""
 
@@ -52,7 +65,7 @@ class Raster:
     Attributes:
         folder: Of the tiles; all that are in it are whole.
         grid: The cells.
-        crs: Coordinate reference system, of rasterio.
+        crs: Coordinate reference system of the map, of rasterio.
         kind: What it shows.
         double: Whether heights need 64-bit floats.
         name: Of the finished file, which tells what its band has (`BANDS`).
@@ -68,13 +81,18 @@ class Raster:
     @property
     def dtype(self) -> str:
         """Of the cells."""
-        kinds = {"heights": "float64" if self.double else "float32", "numbers": "uint32"}
+        kinds = {"heights": "float64" if self.double else "float32", "numbers": "uint32", "counts": "uint16"}
         return kinds.get(self.kind, "uint8")
 
     @property
     def nodata(self) -> float | None:
         """What cells without a surface have; None where a channel says it."""
-        return {"heights": NODATA, "colors": None, "shades": 0, "numbers": 0}[self.kind]
+        return {"heights": NODATA, "colors": None, "shades": 0, "numbers": 0, "counts": NO_COUNT}[self.kind]
+
+    @property
+    def system(self) -> Any:
+        """Coordinate reference system that the file names, of rasterio; None for none."""
+        return system_of_file(self.crs, self.name in HEIGHTS)
 
     def write(self, image: np.ndarray, window: Window, facts: dict[str, Any] | None = None) -> None:
         """Keep a tile, and what was counted when it was drawn; tiles that are not written are empty.
@@ -88,7 +106,9 @@ class Raster:
         from rasterio.io import MemoryFile
 
         gsd, west, north = self.grid.gsd, self.grid.west + window.left, self.grid.north - window.top
-        place = {"crs": self.crs, "transform": Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd)}
+        place = {"crs": self.system, "transform": Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd)}
+        if self.kind == "counts":
+            image = np.where(image == NODATA, NO_COUNT, image.clip(0, NO_COUNT - 1))
         image = image.reshape(-1, window.height, window.width).astype(self.dtype, copy=False)
         inner = {
             "tiled": True,
@@ -120,11 +140,14 @@ class Raster:
         grid = self.grid
         west, _, _, north = grid.bounds
         root = ElementTree.Element("VRTDataset", rasterXSize=str(grid.width), rasterYSize=str(grid.height))
-        ElementTree.SubElement(root, "SRS").text = self.crs.to_wkt()
+        if self.system is not None:
+            ElementTree.SubElement(root, "SRS").text = self.system.to_wkt()
         place = west, grid.gsd, 0.0, north, 0.0, -grid.gsd
         ElementTree.SubElement(root, "GeoTransform").text = ", ".join(map(repr, place))
         tiles = sorted(self.folder.glob("*.tif"))
-        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint32": "UInt32"}[self.dtype]
+        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint16": "UInt16", "uint32": "UInt32"}[
+            self.dtype
+        ]
         for channel, color in enumerate(CHANNELS[self.kind], 1):
             band = ElementTree.SubElement(root, "VRTRasterBand", dataType=kind, band=str(channel))
             if self.nodata is not None:
@@ -152,6 +175,28 @@ class Raster:
 
     def _file(self, window: Window) -> Path:
         return self.folder / f"{window.left}-{window.top}-{window.width}-{window.height}.tif"
+
+
+@lru_cache(maxsize=16)
+def system_of_file(crs: Any, has_heights: bool) -> Any:
+    """The coordinate reference system that a GeoTIFF on a map names, of rasterio; None for none.
+
+    Without heights, it is that of easting and northing alone. A local system whose unit is of unknown length is left
+    out, as the format has no such unit: GDAL reads whatever is written as metres.
+
+    Args:
+        crs: Of the map, of rasterio.
+        has_heights: Whether the file has heights above the datum.
+    """
+    from pyproj import CRS
+
+    if UNKNOWN_UNIT.search(crs.to_wkt()):
+        return None
+    whole = CRS.from_wkt(crs.to_wkt(version="WKT2_2019"))
+    if has_heights or len(whole.axis_info) < 3:
+        return crs
+    plan = whole.sub_crs_list[0] if whole.is_compound else whole  # with its shift of datum, if it has one
+    return type(crs).from_wkt(plan.to_2d().to_wkt())
 
 
 def length_unit(crs: Any) -> str | None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surfkit.apps.maps.cell_shares import OutlinePieces, outline_pieces
+from surfkit.apps.maps.geopackage import write_layer
 from surfkit.apps.maps.geotiff import GDAL_CACHE_MB, GeoTiffSettings
 from surfkit.apps.maps.hillshade import read_heights
 from surfkit.apps.maps.map_grid import MapGrid, Window
@@ -241,7 +242,12 @@ def _centres(grid: MapGrid, window: Window, cells: np.ndarray) -> np.ndarray:
 
 
 def write_volumes(
-    sheet: GeoTiffSettings, polygons: Sequence[AreaPolygon], volumes: Sequence[Volume], layer: str, table: str
+    sheet: GeoTiffSettings,
+    polygons: Sequence[AreaPolygon],
+    volumes: Sequence[Volume],
+    layer: str,
+    table: str,
+    types: str,
 ) -> None:
     """Write volumes as a table, and as a layer `volumes` of polygons in the coordinates of the map.
 
@@ -251,9 +257,10 @@ def write_volumes(
         volumes: Of each of them.
         layer: File name of the GeoPackage.
         table: File name of the CSV file; values that are not known are empty.
+        types: File name of the types of its columns, without which QGIS and GDAL take numbers for texts.
     """
     with needed("pyogrio", "--volume"):
-        from pyogrio.raw import write
+        import pyogrio  # noqa: F401
     names = [field.name for field in fields(Volume)]
     rows = [asdict(volume) for volume in volumes]
     text = io.StringIO(newline="")
@@ -261,6 +268,8 @@ def write_volumes(
     writer.writeheader()
     writer.writerows(rows)
     (sheet.folder / table).write_text(text.getvalue(), encoding="utf-8", newline="")
+    kinds = ['"String"' if isinstance(value, str) else '"Real"' for value in rows[0].values()]
+    (sheet.folder / types).write_text(",".join(kinds) + "\n", encoding="utf-8", newline="")
     path = sheet.folder / layer
     for rest in sheet.folder.glob(f"{layer}*"):  # of an interrupted call
         rest.unlink()
@@ -270,8 +279,8 @@ def write_volumes(
         texts = isinstance(values[0], str)
         columns.append(np.array(values, object) if texts else np.array(values, np.float64))  # None is NaN, a NULL there
     shapes = np.array([polygon.shape.wkb for polygon in polygons], object)
-    kind = {"layer": "volumes", "driver": "GPKG", "geometry_type": "MultiPolygon", "crs": sheet.crs.to_wkt()}
-    write(path, shapes, columns, names, **kind)
+    write_layer(path, "volumes", "MultiPolygon", sheet.crs, shapes, columns, names)
+    sheet.deliver(sheet.folder / types)
     sheet.deliver(sheet.folder / table)
     sheet.deliver(path)
 

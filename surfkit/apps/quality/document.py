@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Literal
 
 PRINT_WIDTH_MM = 174.0
@@ -105,12 +106,14 @@ class Document:
         subtitle: Below it, and at the top of all other pages.
         footer: At the foot of each page.
         sections: The first one is on the first page.
+        moment: When what it tells of was made, UTC.
     """
 
     title: str
     subtitle: str
     footer: str
     sections: tuple[Section, ...]
+    moment: datetime
 
 
 def facts(title: str, pairs: Sequence[tuple[str, str]], note: str = "") -> Table:

@@ -42,6 +42,10 @@ def pdf(document: Document) -> bytes:
     frame = Frame(margin, 18 * mm, PRINT_WIDTH_MM * mm, height - 38 * mm, 0, 0, 0, 0)
 
     class Template(BaseDocTemplate):
+        def beforeDocument(self) -> None:
+            # Invariant documents are of the year 2000 to reportlab; the date is that of the results, so it is no clock.
+            self.canv.setDateFormatter(lambda *_: f"{document.moment:D:%Y%m%d%H%M%S}+00'00'")
+
         def afterFlowable(self, flowable: Any) -> None:
             if (section := getattr(flowable, "section", None)) is not None:
                 self.canv.bookmarkPage(section.address)

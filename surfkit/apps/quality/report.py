@@ -28,8 +28,10 @@ def document_of(survey: Survey) -> Document:
     """The whole report."""
     ground = ground_of(survey)
     counts = None if ground is None else overlap(survey, ground)
+    moment = last_written(survey)
+    day = "not known" if moment is None else f"{moment:%Y-%m-%d}"
     found: tuple[Section | None, ...] = (
-        summary(Findings(survey, ground, counts), processed(survey)),
+        summary(Findings(survey, ground, counts), day),
         overlap_section(survey, ground, counts),
         positions(survey),
         control(survey),
@@ -41,16 +43,17 @@ def document_of(survey: Survey) -> Document:
         appendix(survey),
     )
     sections = tuple(section for section in found if section is not None)
-    return Document("Quality report", survey.name, f"surfkit {own_version()}", sections)
+    moment = moment or datetime.now(timezone.utc)
+    return Document("Quality report", survey.name, f"surfkit {own_version()}", sections, moment)
 
 
-def processed(survey: Survey) -> str:
-    """The day, UTC, on which the last of its results was written; what a report adds does not count."""
+def last_written(survey: Survey) -> datetime | None:
+    """When the last of its results was written, UTC; what a report adds does not count. None where there are none."""
     paths = [survey.data.path / REPORT_FILE]
     if survey.run is not None:
         paths = [survey.run.metrics, survey.run.mesh, survey.run.out / "run.json"]
     times = [path.stat().st_mtime for path in paths if path.is_file()]
-    return datetime.fromtimestamp(max(times), timezone.utc).strftime("%Y-%m-%d") if times else "not known"
+    return datetime.fromtimestamp(max(times), timezone.utc) if times else None
 
 
 def write_quality(target: Path, out: Path, with_pdf: bool) -> list[Path]:

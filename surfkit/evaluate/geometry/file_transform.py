@@ -15,6 +15,7 @@ from pyproj.exceptions import CRSError
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.io.glb import read_glb
+from surfkit.scene.scene import offset_of_comment
 
 Y_AXIS, Z_AXIS = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -81,7 +82,11 @@ def root_of(path: Path) -> dict[str, Any]:
 
 def notes_in(text: str) -> dict[str, str]:
     """What the first lines of a file say of its coordinates, by name."""
-    return {key.replace("_", " "): value.strip() for key, value in NOTE.findall(text.replace("\r", ""))}
+    notes = {key.replace("_", " "): value.strip() for key, value in NOTE.findall(text.replace("\r", ""))}
+    if "offset" in notes:
+        notes["offset"], system = offset_of_comment(notes["offset"])
+        notes |= {"crs": system} if system else {}  # earlier files have a line of their own for it
+    return notes
 
 
 def offset_in(path: Path, lines: Sequence[str]) -> tuple[float, float, float]:

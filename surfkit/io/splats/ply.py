@@ -17,7 +17,7 @@ from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.splat_table import SplatTable, Tile
-from surfkit.scene.scene import Frame
+from surfkit.scene.scene import Frame, offset_of_comment
 
 WRITTEN_ROWS = 1 << 16
 """Rows in memory while writing."""
@@ -213,7 +213,7 @@ def shifted(path: Path, xyz: np.ndarray, tags: Mapping[str, str]) -> np.ndarray:
     if offset is None:
         return xyz
     try:
-        shift = np.array([float(word) for word in offset.split()])
+        shift = np.array([float(word) for word in offset_of_comment(offset)[0].split()])
     except ValueError:
         shift = np.zeros(0)
     if shift.shape != (3,) or not np.isfinite(shift).all():

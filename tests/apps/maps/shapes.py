@@ -61,3 +61,8 @@ def centres(grid):
 
 def grid_of(gsd, west, south, east, north):
     return MapGrid.around(np.eye(3), gsd, (west, south, east, north))
+
+
+def gpkg_version(path):
+    """The version of a GeoPackage, such as 10200 for 1.2.0: `user_version` of SQLite, from byte 60 on."""
+    return int.from_bytes(path.read_bytes()[60:64], "big")

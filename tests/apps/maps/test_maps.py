@@ -169,6 +169,6 @@ def test_volumes_of_a_run_are_printed_and_lines_are_refused(run, tmp_path, capsy
     assert "yard" in said.out and "fill" in said.out and "changes" in said.out and "as those of the map" in said.err
     found = json.loads((tmp_path / "m/maps.json").read_text())["volumes"]
     assert found["net"] == pytest.approx(16) and found["polygons"][0]["net_since"] == pytest.approx(16, rel=0.1)
-    assert {"volumes.csv", "volumes.gpkg"} <= {path.name for path in (tmp_path / "m").iterdir()}
+    assert {"volumes.csv", "volumes.csvt", "volumes.gpkg"} <= {path.name for path in (tmp_path / "m").iterdir()}
     assert main([*words, "--volume", str(tmp_path / "LineString.geojson")]) == 2
     assert "it is a LineString; only polygons have an area" in capsys.readouterr().err

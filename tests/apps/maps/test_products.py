@@ -26,7 +26,7 @@ from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
-from .shapes import UTM, centres, grid_of, heightfield, merged
+from .shapes import UTM, centres, gpkg_version, grid_of, heightfield, merged
 
 rasterio = needs("rasterio")
 FRAME = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, "EPSG:32633")
@@ -322,6 +322,7 @@ def test_all_products_of_a_hill(tmp_path):
     assert (
         "32633" in meta["crs"] and list(meta["fields"]) == ["elevation"] and len(levels) == record["contours"]["lines"]
     )
+    assert gpkg_version(tmp_path / "contours.gpkg") == 10200
     assert set(levels) == {20, 25, 30, 35}
     lengths = dict.fromkeys(levels, 0.0)
     for level, shape in zip(levels, shapes, strict=True):

@@ -7,7 +7,7 @@ from needs import needs
 from surfkit.apps.maps.geotiff import GeoTiffSettings, workshop
 from surfkit.apps.maps.map_grid import MapGrid, map_crs
 from surfkit.apps.maps.owned_files import PRODUCT_FILES
-from surfkit.apps.maps.rasters import BANDS, NODATA
+from surfkit.apps.maps.rasters import BANDS, NO_COUNT, NODATA, system_of_file
 from surfkit.apps.maps.surface_model import draw_surface, needs_double
 from surfkit.apps.maps.zbuffer import NO_TRIANGLE
 from surfkit.core.check import BadInput
@@ -127,6 +127,46 @@ def test_bands_say_what_they_have_and_in_which_unit(surface, tmp_path, crs, metr
     written(surface, tmp_path, 2048, frame=Frame(np.zeros(3), 1.0, metres, crs))
     with rasterio.open(tmp_path / "dsm.tif") as file:
         assert (file.descriptions, file.units) == (("height of the surface",), (unit,))
+
+
+def test_only_heights_name_their_datum(surface, tmp_path):
+    """GDAL takes bands for heights in its unit, and gdalwarp shifts them by the geoid, where a file names it."""
+    written(surface, tmp_path, 2048, frame=Frame(np.zeros(3), 1.0, 1.0, "EPSG:32633+5773"))
+    with rasterio.open(tmp_path / "dsm.tif") as file, rasterio.open(tmp_path / "orthophoto.tif") as photo:
+        assert "5773" in file.crs.to_wkt() and photo.crs.to_epsg() == 32633
+        assert file.units == ("metre",) and photo.units == (None,) * 4
+        assert (file.transform, file.shape) == (photo.transform, photo.shape)
+    compound = "EPSG:2263+6360"
+    assert system_of_file(rasterio.CRS.from_user_input(compound), has_heights=False).to_epsg() == 2263
+    shift = "+proj=tmerc +lon_0=9 +x_0=3500000 +ellps=bessel +towgs84=598,74,418,0,0,0,0 +units=m +vunits=m"
+    plan = system_of_file(rasterio.CRS.from_user_input(f"{shift} +geoidgrids=a.gtx"), has_heights=False).to_wkt()
+    assert plan.startswith("PROJCS") and "TOWGS84[598" in plan, "else it would lie 100 m from the heights"
+
+
+@pytest.mark.parametrize(("metres", "factor"), [(1.0, 'metre",1'), (2.0, "2"), (None, None)])
+def test_a_unit_of_unknown_length_is_no_metre(surface, tmp_path, metres, factor):
+    written(surface, tmp_path, 2048, frame=Frame(np.zeros(3), 1.0, metres))
+    for name in ("dsm.tif", "orthophoto.tif"):
+        with rasterio.open(tmp_path / name) as file:
+            assert (file.crs is None) if factor is None else factor in file.crs.to_wkt()
+            assert file.transform.a == 0.25
+
+
+def test_counts_are_whole_in_overviews_too(tmp_path):
+    grid = grid_of(1.0, *UTM, UTM[0] + 700, UTM[1] + 700)
+    counts = np.where(np.indices((700, 700)).sum(0) % 2, 3.0, 0.0)
+    counts[:100], counts[100:110] = NODATA, 1e6
+    crs, _ = map_crs(Frame(np.zeros(3), 1.0, 1.0, "EPSG:32633"))
+    with workshop(tmp_path, ("rays.tif",)) as folder:
+        with GeoTiffSettings(grid, crs, folder, tmp_path).raster("rays.tif", "heights") as raster:
+            raster.write(counts, next(grid.tiles(1000)), {})
+    with rasterio.open(tmp_path / "rays.tif") as file:
+        assert file.dtypes == ("uint16",) and file.nodata == NO_COUNT and file.overviews(1)
+        found = file.read(1, masked=True)
+        assert found.mask[:100].all() and not found.mask[100:].any() and (found[100:110] == NO_COUNT - 1).all()
+        assert (found[110:] == counts[110:]).all()
+    with rasterio.open(tmp_path / "rays.tif", overview_level=0) as file:
+        assert set(np.unique(file.read(1)[60:])) <= {0, 3}, "no mean of counts is one"
 
 
 def test_bands_are_named_after_the_files_that_exist():

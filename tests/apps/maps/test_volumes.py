@@ -17,10 +17,10 @@ from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.scene.scene import Frame
 
-from .shapes import UTM, grid_of, heightfield
+from .shapes import UTM, gpkg_version, grid_of, heightfield
 
 needs("rasterio")
-raw = needs("pyogrio.raw")
+pyogrio, raw = needs("pyogrio"), needs("pyogrio.raw")
 shapely = needs("shapely")
 FRAME = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, "EPSG:32633")
 MIDDLE = np.array([UTM[0] + 10, UTM[1] + 10])
@@ -242,6 +242,10 @@ def test_the_table_and_the_layer_say_what_the_record_says(tmp_path):
     for at, each in enumerate(found):
         assert rows[at]["name"] == layer["name"][at] == each["name"] and rows[at]["base_error"] == ""
         assert float(rows[at]["net"]) == layer["net"][at] == each["net"] and np.isnan(layer["base_error"][at])
+    assert gpkg_version(tmp_path / "maps/volumes.gpkg") == 10200
+    known = pyogrio.read_info(tmp_path / "maps/volumes.csv")
+    texts = {name for name, kind in zip(known["fields"], known["dtypes"], strict=True) if kind == "object"}
+    assert texts == {"name", "base"}, "all others are numbers to QGIS"
     again = measured(tmp_path, tmp_path / "maps/volumes.gpkg", heap)
     assert [each["net"] for each in again] == pytest.approx([each["net"] for each in found])
 

@@ -4,6 +4,7 @@ import io
 import re
 import sys
 from dataclasses import replace
+from datetime import timedelta
 from html.parser import HTMLParser
 from typing import Any
 
@@ -23,7 +24,7 @@ from surfkit.apps.quality.report import document_of
 from surfkit.apps.quality.sections.calibration import radial_distortion
 from surfkit.apps.quality.sections.maps_section import covered, surface
 from surfkit.apps.quality.sections.residuals import control, positions
-from surfkit.apps.quality.sections.summary import focal_warnings, ground_sampling_distance
+from surfkit.apps.quality.sections.summary import Findings, focal_warnings, ground_sampling_distance, warnings
 from surfkit.apps.quality.sections.tie_point_section import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
 from surfkit.apps.quality.sparse_model import SparseModel
 from surfkit.apps.quality.survey import open_survey
@@ -113,6 +114,10 @@ def test_pdf_is_read_by_others_and_says_the_same(scene, document, tmp_path, monk
     assert main(["quality", str(scene), "--out", str(tmp_path / "one.html")]) == 0
     content = (tmp_path / "one.pdf").read_bytes()
     assert content == pdf(document) and len(content) < 10e6
+    made = reader.PdfReader(io.BytesIO(content)).metadata.creation_date
+    written = (scene / "report.json").stat().st_mtime
+    assert made.utcoffset() == timedelta(0) and 0 <= written - made.timestamp() < 1, "when its results were written"
+    assert pdf(replace(document, moment=document.moment + timedelta(1))) != content
     pages = reader.PdfReader(io.BytesIO(content)).pages
     first = " ".join(pages[0].extract_text().split())
     for words in ("Quality report", "Quarry & hill", "2024-05-02 to 2024-05-03", "30 of 32", "EPSG:32633", "page 1"):
@@ -233,6 +238,18 @@ def test_the_first_page_tells_that_heights_depend_on_exif(survey):
         said = focal_warnings(replace(survey, prepared={**survey.prepared, "models": models}))
         assert len(said) == count
         assert not count or "38.9 m above the ground" in said[-1]
+
+
+def test_the_first_page_says_by_how_much_positions_contradict(survey):
+    def said(left_out):
+        models = [{**survey.prepared["models"][0], "georeference": {"left_out": left_out}}]
+        found = replace(survey, prepared={**survey.prepared, "models": models})
+        return " ".join(warnings(Findings(found, None, None), None))
+
+    assert "contradict" not in said({})
+    assert "1 position of a photograph contradicts the others by 3.1 m and was left out." in said({"a.jpg": 3.1})
+    assert "2 positions of photographs contradict the others by 3.1 to 1,250.0 m" in said({"a": 1250, "b": 3.1})
+    assert "contradicts the others and was left out." in said({"a.jpg": None})
 
 
 def test_control_points_are_listed_with_their_photographs(survey):

@@ -327,7 +327,7 @@ def test_tiles_have_each_triangle_once_and_boxes_hold_them(tmp_path):
     assert (np.sort(ours, axis=0) == np.sort(theirs, axis=0)).mean() > 0.9
     assert np.abs(np.sort(ours, axis=0) - np.sort(theirs, axis=0)).max() < 0.02
     text = (tmp_path / "out" / "textured.obj").read_text()
-    assert "# offset: 500000 5800000 0\n" in text and "# crs: EPSG:32633\n" in text
+    assert "# offset: 500000 5800000 0 (add it to x y z to get EPSG:32633)\n" in text
     first = np.array(next(line for line in text.splitlines() if line.startswith("v ")).split()[1:], float)
     assert np.allclose(first, [-HALF, -HALF, 0], atol=1e-4)
 

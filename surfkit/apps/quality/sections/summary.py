@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,9 +184,10 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
             said.append(f"Check points are off by {times:.1f} ground sampling distances; {MAX_CHECK_GSD:g} are usual.")
     if left := texts(survey.ground_control, "left_out"):
         said.append(f"Control points contradict the others and were left out: {', '.join(left)}.")
-    if left := list(mapping(survey.georeference, "left_out")):
-        what = "1 position of a photograph contradicts the others and was" if len(left) == 1 else (
-            f"{len(left)} positions of photographs contradict the others and were"
+    if left := mapping(survey.georeference, "left_out"):
+        by = _distances([number(left, name) for name in left])
+        what = f"1 position of a photograph contradicts the others{by} and was" if len(left) == 1 else (
+            f"{len(left)} positions of photographs contradict the others{by} and were"
         )  # fmt: skip
         said.append(f"{what} left out.")
     said += focal_warnings(survey)
@@ -199,6 +201,15 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
     elif survey.delivery.get("quality") == "draft":
         said.append(f"This is a draft ({fixed(steps, 0)} steps): the surface is a first look.")
     return said
+
+
+def _distances(metres: Sequence[float | None]) -> str:
+    """How far positions are off: " by 3.1 m", " by 3.1 to 250.0 m", or "" where that is not known."""
+    known = [value for value in metres if value is not None]
+    if not known:
+        return ""
+    least, most = fixed(min(known), 1), fixed(max(known), 1)
+    return f" by {most} m" if least == most else f" by {least} to {most} m"
 
 
 def focal_warnings(survey: Survey) -> list[str]:
