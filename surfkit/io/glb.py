@@ -72,13 +72,11 @@ class GlbWriter:
 
 
 def linear_colors(srgb: np.ndarray) -> np.ndarray:
-    """(N, 4) uint16 for COLOR_0, opaque, of (N, 3) uint8 as they are on a screen.
+    """(N, 3) float32 for COLOR_0, of (N, 3) uint8 as they are on a screen.
 
-    glTF has linear colours there, and 8 bits of these would be too few for dark ones.
+    glTF has linear colours there: 8 bits would be too few for dark ones, and MeshLab reads 16 bits as noise.
     """
-    colors = np.full((len(srgb), 4), 65535, "<u2")
-    colors[:, :3] = np.round(65535 * linear(np.arange(256) / 255))[srgb]
-    return colors
+    return linear(np.arange(256) / 255).astype("<f4")[srgb]
 
 
 def glb(where: str | Path, document: dict[str, Any], blocks: GlbWriter, remedy: str) -> Iterator[bytes]:

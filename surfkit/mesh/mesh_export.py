@@ -14,7 +14,7 @@ import numpy as np
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.io.glb import FLOAT, INDICES, UNSIGNED_INT, UNSIGNED_SHORT, VERTICES, GlbWriter, linear_colors, write_glb
+from surfkit.io.glb import FLOAT, INDICES, UNSIGNED_INT, VERTICES, GlbWriter, linear_colors, write_glb
 from surfkit.mesh.base import LENGTHS, Mesh
 from surfkit.scene.scene import Frame
 
@@ -104,9 +104,8 @@ def write_mesh_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     view = blocks.add(4 * faces.size, lambda: faces.astype("<u4").tobytes(), target=INDICES)
     indices = blocks.accessor(view, count=faces.size, componentType=UNSIGNED_INT, type="SCALAR")
     if (colors := mesh.colors) is not None:
-        view = blocks.add(8 * count, lambda: linear_colors(colors).tobytes(), target=VERTICES, byteStride=8)
-        about = {"componentType": UNSIGNED_SHORT, "normalized": True, "type": "VEC4"}
-        attributes["COLOR_0"] = blocks.accessor(view, count=count, **about)
+        view = blocks.add(12 * count, lambda: linear_colors(colors).tobytes(), target=VERTICES, byteStride=12)
+        attributes["COLOR_0"] = blocks.accessor(view, count=count, componentType=FLOAT, type="VEC3")
     for name, each in in_files(mesh, frame).items():
         known = np.where(np.isfinite(each), each, np.float32(GLB_UNKNOWN))
         view = blocks.add(4 * count, known.tobytes, target=VERTICES, byteStride=4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfkit.io.glb import FLOAT, INDICES, UNLIT, UNSIGNED_INT, UNSIGNED_SHORT, VERTICES, GlbWriter, glb, linear_colors
+from surfkit.io.glb import FLOAT, INDICES, UNLIT, UNSIGNED_INT, VERTICES, GlbWriter, glb, linear_colors
 from surfkit.mesh.base import Mesh
 
 
@@ -17,7 +17,7 @@ def unlit_glb(mesh: Mesh) -> bytes:
     ends = {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
     position = blocks.accessor(view, count=len(places), componentType=FLOAT, type="VEC3", **ends)
     view = blocks.add(colors.nbytes, colors.tobytes, target=VERTICES)
-    color = blocks.accessor(view, count=len(places), componentType=UNSIGNED_SHORT, type="VEC4", normalized=True)
+    color = blocks.accessor(view, count=len(places), componentType=FLOAT, type="VEC3")
     view = blocks.add(faces.nbytes, faces.tobytes, target=INDICES)
     indices = blocks.accessor(view, count=faces.size, componentType=UNSIGNED_INT, type="SCALAR")
     attributes = {"POSITION": position, "COLOR_0": color}
