@@ -157,9 +157,11 @@ def show(out: Path, record: dict[str, Any]) -> None:
     ]
     if found := record.get("orthophoto"):
         rows.append(("orthophoto", f"{found['from_photographs']:.1%} of it from photographs, the rest from the mesh"))
-    if found := record.get("contours"):
-        left = f"; {found['too_short']:,} shorter than {found['shortest']:g} {unit} left out" * (found["too_short"] > 0)
-        rows.append(("contour lines", f"{found['lines']:,}, every {found['interval']:g} {unit}{left}"))
+    for key, name in (("contours", "contour lines"), ("terrain_contours", "contour lines of the terrain")):
+        if found := record.get(key):
+            short = f"; {found['too_short']:,} shorter than {found['shortest']:g} {unit} left out"
+            left = short if found["too_short"] else ""
+            rows.append((name, f"{found['lines']:,}, every {found['interval']:g} {unit}{left}"))
     if found := record.get("points"):
         rows.append(("points", f"{found['points']:,}, one for {found['spacing']:g} x {found['spacing']:g} {unit}"))
     if found := record.get("terrain"):

@@ -1,4 +1,4 @@
-"""Contour lines of a surface model, as a GeoPackage."""
+"""Contour lines of a surface or terrain model, as a GeoPackage."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ def even_interval(lowest: float, highest: float) -> float:
 def write_contours(
     sheet: GeoTiffSettings, heights: str, name: str, interval: float, least: float, side: int
 ) -> tuple[int, int]:
-    """Write the contour lines of a surface model of `sheet.out`; how many there are, and how many were too short.
+    """Write the contour lines of heights in `sheet.out`; how many there are, and how many were too short.
 
     They are traced tile by tile, put together where tiles meet, and end where there is no surface.
 
     Args:
         sheet: Where.
-        heights: File name of the surface model.
-        name: File name of the GeoPackage: a layer `contours` with a field `elevation`.
+        heights: File name of the surface or terrain model.
+        name: File name of the GeoPackage: a layer of the same name, `contours` or `contours_terrain`, with a field
+            `elevation`.
         interval: Between levels, units of the input; levels are its multiples.
         least: Shorter lines are left out, units of the input.
         side: Of a tile, cells.
@@ -90,7 +91,7 @@ def _append(lines: list[Line], path: Path, crs: Any) -> int:
 
     shapes = np.array([shapely.LineString(line).wkb for _, line in lines], object)
     levels = np.array([level for level, _ in lines], np.float64)
-    write_layer(path, "contours", "LineString", crs, shapes, [levels], ["elevation"])
+    write_layer(path, path.stem.replace("-", "_"), "LineString", crs, shapes, [levels], ["elevation"])
     return len(lines)
 
 

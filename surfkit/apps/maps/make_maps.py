@@ -21,6 +21,7 @@ from surfkit.apps.maps.map_settings import (
     COMPARISON_FILES,
     SEVERAL_FILES,
     SHORTEST_CELLS,
+    TERRAIN_CONTOURS,
     VOLUME_FILES,
     VOLUME_OPTION,
     MapSettings,
@@ -213,12 +214,12 @@ def draw_products(
     units = subject.frame.metres or 1.0
     if "hillshade" in done:
         sheet.once([PRODUCT_FILES["hillshade"]], lambda: shade(sheet, settings.tile))
+    given = settings.interval
+    interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
+    least = SHORTEST_CELLS * sheet.grid.gsd if settings.shortest == "auto" else settings.shortest / units
+    lines = partial(trace, sheet, interval, least, settings.tile)
     if "contours" in done:
-        given = settings.interval
-        interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
-        least = SHORTEST_CELLS * sheet.grid.gsd if settings.shortest == "auto" else settings.shortest / units
-        name = PRODUCT_FILES["contours"]
-        record["contours"] = sheet.once([name], lambda: trace(sheet, interval, least, settings.tile))
+        record["contours"] = sheet.once([PRODUCT_FILES["contours"]], partial(lines, "dsm", "contours"))
     classify = None
     if "terrain" in done:
         names = [PRODUCT_FILES[name] for name in SEVERAL_FILES["terrain"]]
@@ -227,6 +228,9 @@ def draw_products(
             names, lambda: write_terrain(sheet, ground, PRODUCT_FILES["dsm"], names, settings.tile)
         )
         classify = partial(ground.classes_of, grid=sheet.grid)
+    if TERRAIN_CONTOURS in done:
+        files = [PRODUCT_FILES[TERRAIN_CONTOURS]]
+        record["terrain_contours"] = sheet.once(files, partial(lines, "terrain", TERRAIN_CONTOURS))
     if "points" in done:
         spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
         record["points"] = sheet.once(
@@ -251,9 +255,11 @@ def shade(sheet: GeoTiffSettings, side: int) -> dict[str, Any]:
     return {}
 
 
-def trace(sheet: GeoTiffSettings, interval: float, least: float, side: int) -> dict[str, Any]:
-    """Write the contour lines, and return what maps.json says of them."""
-    lines, short = write_contours(sheet, PRODUCT_FILES["dsm"], PRODUCT_FILES["contours"], interval, least, side)
+def trace(
+    sheet: GeoTiffSettings, interval: float, least: float, side: int, heights: str, contours: str
+) -> dict[str, Any]:
+    """Write the contour lines of a product, and return what maps.json says of them."""
+    lines, short = write_contours(sheet, PRODUCT_FILES[heights], PRODUCT_FILES[contours], interval, least, side)
     return {"interval": interval, "lines": lines, "shortest": least, "too_short": short}
 
 

@@ -22,6 +22,8 @@ USUAL_PRODUCTS: tuple[Product, ...] = PRODUCTS[:4]
 """All but the terrain, which is a guess with settings of its own, and the precision, which needs depth maps."""
 SEVERAL_FILES = {"precision": ("precision", "rays"), "terrain": ("terrain", "above", "ground")}
 """Files of products that are more than one."""
+TERRAIN_CONTOURS = "terrain-contours"
+"""File of the contour lines of the terrain, which are drawn where both are."""
 COMPARISON_FILES = ("other", "difference", "picture")
 """Files of a comparison."""
 SHORTEST_CELLS = 30
@@ -39,8 +41,8 @@ class MapSettings:
 
     products: tuple[Product, ...] = USUAL_PRODUCTS
     """What to write beside the surface model (dsm.tif). `terrain` is the ground without buildings and trees, heights
-    above it, and classes of the points; `precision` is the expected error of each height, and needs the depth maps that
-    the run was trained with."""
+    above it, classes of the points, and contour lines of the ground where `contours` is named too; `precision` is the
+    expected error of each height, and needs the depth maps that the run was trained with."""
 
     gsd: Length = "auto"
     """Side of a cell (ground sampling distance), metres; in units of the data set where it does not say how long these
@@ -120,7 +122,8 @@ class MapSettings:
     def names(self) -> tuple[str, ...]:
         """Names of the files in PRODUCT_FILES, the surface model first."""
         chosen = (SEVERAL_FILES.get(name, (name,)) for name in PRODUCTS if name in self.products)
-        return ("dsm", *(name for names in chosen for name in names))
+        both = {"contours", "terrain"} <= {*self.products}
+        return ("dsm", *(name for names in chosen for name in names), *([TERRAIN_CONTOURS] if both else []))
 
     def refuse_missing(self) -> None:
         """BadInput if a package is missing, before anything is done."""

@@ -17,6 +17,7 @@ PRODUCT_FILES = {
     "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.copc.laz", "precision": "precision.tif", "rays": "rays.tif",
     "terrain": "dtm.tif", "above": "ndsm.tif", "ground": "ground-distance.tif",
+    "terrain-contours": "contours-terrain.gpkg",
     "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
     "volumes": "volumes.gpkg", "volumes-table": "volumes.csv", "volumes-types": "volumes.csvt",
 }  # fmt: skip

@@ -14,7 +14,7 @@ from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.core.check import BadInput
 from surfkit.scene.scene import Frame
 
-from .shapes import UTM, centres, grid_of, heightfield, surface_of
+from .shapes import UTM, centres, gpkg_version, grid_of, heightfield, surface_of
 
 rasterio = needs("rasterio")
 FRAME = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, "EPSG:32633")
@@ -98,6 +98,20 @@ def test_the_terrain_is_the_ground_below_houses_and_trees(tmp_path, ground):
     with rasterio.open(tmp_path / "dtm.tif") as file, rasterio.open(tmp_path / "dsm.tif") as model:
         assert (file.crs, file.transform, file.nodata) == (model.crs, model.transform, model.nodata)
         assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG" and file.dtypes == ("float32",)
+
+
+def test_contour_lines_of_the_terrain_do_not_go_around_houses(tmp_path):
+    raw = needs("pyogrio.raw")
+    settings = MapSettings(("contours", "terrain"), GSD, up="z", interval=1.0, shortest=15.0)
+    record = make_maps(MeshWithPhotos(scene(plane), FRAME), settings, tmp_path)
+    assert record["files"][-1] == "contours-terrain.gpkg" and (tmp_path / "contours-terrain.gpkg").exists()
+    meta, _, shapes, (levels,) = raw.read(tmp_path / "contours-terrain.gpkg", layer="contours_terrain")
+    assert len(levels) == record["terrain_contours"]["lines"] < record["contours"]["lines"]
+    assert list(meta["fields"]) == ["elevation"] and gpkg_version(tmp_path / "contours-terrain.gpkg") == 10200
+    for level, shape in zip(levels, shapes, strict=True):
+        u, v = (np.frombuffer(shape[9:], "<f8").reshape(-1, 2) - UTM).T
+        assert np.abs(plane(u, v) - level).max() < 1.2, "the ground, below houses too"
+        assert np.hypot(*np.diff([u, v])).sum() >= 15
 
 
 def test_results_do_not_depend_on_tiles(tmp_path, monkeypatch):

@@ -184,10 +184,10 @@ def warnings(found: Findings, distance: float | None) -> list[str]:
             said.append(f"Check points are off by {times:.1f} ground sampling distances; {MAX_CHECK_GSD:g} are usual.")
     if left := texts(survey.ground_control, "left_out"):
         said.append(f"Control points contradict the others and were left out: {', '.join(left)}.")
-    if left := mapping(survey.georeference, "left_out"):
-        by = _distances([number(left, name) for name in left])
-        what = f"1 position of a photograph contradicts the others{by} and was" if len(left) == 1 else (
-            f"{len(left)} positions of photographs contradict the others{by} and were"
+    if off := mapping(survey.georeference, "left_out"):
+        by = _distances([number(off, name) for name in off])
+        what = f"1 position of a photograph contradicts the others{by} and was" if len(off) == 1 else (
+            f"{len(off)} positions of photographs contradict the others{by} and were"
         )  # fmt: skip
         said.append(f"{what} left out.")
     said += focal_warnings(survey)
