@@ -25,7 +25,7 @@ from surfkit.apps.maps.owned_files import (
     own_files,
     refuse_foreign,
 )
-from surfkit.apps.maps.rasters import COUNTS, TILE_SIDE_CELLS, Kind, Raster
+from surfkit.apps.maps.rasters import TILE_SIDE_CELLS, Kind, Raster
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
@@ -70,14 +70,13 @@ class GeoTiffSettings:
         """A raster to write tiles of, that becomes the Cloud Optimized GeoTIFF `name` in `out` when all went well.
 
         Heights have NODATA where there is nothing; colours have a fourth channel that is 0 there and 255 elsewhere;
-        shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits. Counts (`COUNTS`) are 0 and more,
+        shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits. Counts are 0 and more,
         of 16 bits, whatever the kind is called, and NO_COUNT where there is nothing.
         """
         import rasterio
 
         folder = self.folder / f"{name}{TILES_SUFFIX}"
         folder.mkdir(exist_ok=True)
-        kind = "counts" if name in COUNTS else kind
         raster = Raster(folder, self.grid, self.crs, kind, self.double, name)
         with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB):
             yield raster

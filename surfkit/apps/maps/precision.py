@@ -244,7 +244,8 @@ def write_precision(sheet: GeoTiffSettings, rays: Rays, model: str, names: Seque
 
     windows, found = list(sheet.grid.tiles(side)), []
     with rasterio.open(sheet.out / model) as heights, ExitStack() as files:
-        errors, counts = (files.enter_context(sheet.raster(name, "heights")) for name in names)
+        errors = files.enter_context(sheet.raster(names[0], "heights"))
+        counts = files.enter_context(sheet.raster(names[1], "counts"))
         for at, window in enumerate(windows):
             facts = errors.facts(window)
             if facts is None:

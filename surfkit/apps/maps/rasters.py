@@ -45,8 +45,6 @@ BANDS = {
     "orthophoto-photographs.tif": ("number of the photograph", False),
 }
 """What the band of a file has, and whether it is a length in the unit of the map."""
-COUNTS = {"rays.tif"}
-"""Files of whole numbers from 0 on, with NODATA where there is no surface when they are drawn."""
 HEIGHTS = {"dsm.tif", "dsm-other.tif", "dtm.tif"}
 """Files of heights above the datum: no other one names it, as GDAL takes bands without a unit for heights in that of
 the datum, and gdalwarp shifts what names it by the geoid, were it a difference or a picture."""

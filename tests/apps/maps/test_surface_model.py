@@ -158,7 +158,7 @@ def test_counts_are_whole_in_overviews_too(tmp_path):
     counts[:100], counts[100:110] = NODATA, 1e6
     crs, _ = map_crs(Frame(np.zeros(3), 1.0, 1.0, "EPSG:32633"))
     with workshop(tmp_path, ("rays.tif",)) as folder:
-        with GeoTiffSettings(grid, crs, folder, tmp_path).raster("rays.tif", "heights") as raster:
+        with GeoTiffSettings(grid, crs, folder, tmp_path).raster("rays.tif", "counts") as raster:
             raster.write(counts, next(grid.tiles(1000)), {})
     with rasterio.open(tmp_path / "rays.tif") as file:
         assert file.dtypes == ("uint16",) and file.nodata == NO_COUNT and file.overviews(1)
