@@ -183,7 +183,11 @@ def _precision(survey: Survey, bands: np.ndarray, bounds: tuple[float, float, fl
     known = bands[0][np.isfinite(bands[0])]
     if not len(known):
         return [Paragraph("The precision map has no values.", "warning")]
-    middle, ninety = np.percentile(known, [50, 90])
+    told = mapping(survey.maps, "precision")  # of all cells; the picture has fewer, which are means
+    middle, ninety = (
+        float(np.percentile(known, rank)) if (value := number(told, name)) is None else value
+        for name, rank in (("median", 50), ("percentile_90", 90))
+    )
     values = ("viridis", f"standard deviation of heights, {survey.unit}", 0.0, float(np.percentile(known, 98)))
     text = f"Precision of heights: median {fixed(middle, 3)}, 90 % below {fixed(ninety, 3)} {survey.unit}."
     return [drawn_map(survey, bands[0], bounds, "Precision of the surface model", 0.9, values), Paragraph(text)]
