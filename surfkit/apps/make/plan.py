@@ -97,7 +97,8 @@ def chosen(quality: Quality, found: ResourceEstimate | None, photographs: int, s
     """
     if found is None:
         return Decisions(quality.recipe, "one model, as its memory could not be forecast", photographs, steps)
-    told = Forecast(round(found.seconds, 1), found.memory_bytes, found.run_bytes)
+    other = None if found.gpu is not None else round(quality.other_steps * photographs * found.seconds / steps, 1)
+    told = Forecast(round(found.seconds, 1), found.memory_bytes, found.run_bytes, other)
     need, usable, where = _tightest(found)
     rule = f"needs {size(need)} of {where} without photographs, and {size(usable)} (90 % of what is free) can be used"
     if need <= usable:
@@ -160,8 +161,12 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
     if (told := decisions.forecast) is None:
         found.append(("time", "not known: nothing could be measured"))
     else:
-        later = "depth maps, mesh, texture and maps come on top"
-        found.append(("time", f"about {duration(told.seconds)} for the steps of optimisation; {later}"))
-        found.append(("memory", f"{size(told.memory_bytes)} for the same; making the mesh may take more"))
-        found.append(("disk", f"{size(told.disk_bytes)} for the model; {later}"))
+        later = "depth maps, mesh, texture, maps and reports"
+        whole = f"about {duration(told.seconds)} for the steps of optimisation; {later} come on top"
+        if told.other_seconds is not None:
+            whole = f"about {duration(told.seconds + told.other_seconds)}: {duration(told.seconds)} for the steps of "
+            whole += f"optimisation, as measured, and a guess within a factor of 2 for {later}"
+        found.append(("time", whole))
+        found.append(("memory", f"{size(told.memory_bytes)} for the optimisation; making the mesh may take more"))
+        found.append(("disk", f"{size(told.disk_bytes)} for the model; {later} come on top"))
     return found

@@ -25,6 +25,9 @@ class Quality:
         at_most: Most steps.
         times: By which the usual number of steps is multiplied.
         divides: Whether the scene is divided into blocks where one model cannot hold it.
+        other_steps: Optimisation steps on a CPU that take as long as all else for one photograph: depth maps, mesh,
+            texture, maps and reports. All of it grows with the pixels, as a step does. Measured on two surveys, which
+            differ by a factor of 2 (bench/log/field.md).
     """
 
     recipe: str
@@ -32,6 +35,7 @@ class Quality:
     at_most: int | None = None
     times: int = 1
     divides: bool = True
+    other_steps: float = 25.0
 
     def reading(self, given: ReadSettings) -> ReadSettings:
         """How photographs are read: at the size of the preset, unless the user has given one."""

@@ -38,11 +38,19 @@ class FinishedStep:
 
 @dataclass
 class Forecast:
-    """What was measured beforehand, of the optimisation alone."""
+    """What was measured beforehand, of the optimisation alone; of all else a guess.
+
+    Attributes:
+        seconds: Of the optimisation.
+        memory_bytes: The same.
+        disk_bytes: Of the model.
+        other_seconds: Of depth maps, mesh, texture, maps and reports, as `Quality.other_steps` has it; None on a GPU.
+    """
 
     seconds: float
     memory_bytes: int
     disk_bytes: int
+    other_seconds: float | None = None
 
 
 @dataclass

@@ -26,7 +26,7 @@ def test_one_model_where_it_fits():
     found = chosen(QUALITIES["normal"], estimated(), 40, 1_200)
     assert (found.recipe, found.blocks, found.steps) == ("surface", None, 1_200)
     assert "needs 3.2 GB of memory" in found.why and "9.0 GB (90 % of what is free)" in found.why
-    assert recipe_of(found).pretrain.steps == 1_200 and dict(rows(found))["time"].startswith("about 60 s")
+    assert recipe_of(found).pretrain.steps == 1_200 and dict(rows(found))["time"].startswith("about 2 min: 60 s for the steps")
 
 
 def test_blocks_where_it_does_not():
@@ -72,6 +72,20 @@ def test_the_mesh_that_is_delivered_is_closed_and_as_fine_as_that_of_the_recipe(
     assert isinstance(own.mesh, TSDF), "deliveries of earlier versions go on with the mesh that they have"
     assert isinstance(made.mesh, Visibility) and made.mesh.oversampling == own.mesh.oversampling == 1.5
     assert replace(made, mesh=own.mesh) == own
+
+
+def test_the_time_of_all_steps_is_told_beforehand_on_a_cpu():
+    found = chosen(QUALITIES["normal"], estimated(), 40, 100)
+    assert found.forecast is not None
+    others = QUALITIES["normal"].other_steps * 40 * found.forecast.seconds / 100
+    assert found.forecast.other_seconds == pytest.approx(others, abs=0.1)
+    told = dict(rows(found))["time"]
+    assert told.startswith("about ") and "guess" in told and "come on top" not in told
+    longer = found.longer(300).forecast
+    assert longer is not None and longer.other_seconds == found.forecast.other_seconds
+    on_gpu = chosen(QUALITIES["normal"], estimated(gpu=GpuEstimate(10**9, 10**8, 8e2, 8 * 10**9)), 40, 100)
+    assert on_gpu.forecast is not None and on_gpu.forecast.other_seconds is None
+    assert "come on top" in dict(rows(on_gpu))["time"]
 
 
 def test_a_longer_run_takes_as_much_longer():

@@ -288,7 +288,9 @@ def test_maps_are_measured_and_drawn(survey, tmp_path):
     assert table(section, "Volumes").rows == (("heap", "lowest", "10.00", "5.50", "0.25", "5.25"),)
     assert "median 0.100, 90 % below 0.100 m" in texts(section, "plain")[0]
     of_all = replace(mapped, maps=maps | {"precision": {"median": 0.05, "percentile_90": 0.3}})
-    assert "median 0.050, 90 % below 0.300 m" in texts(surface(of_all), "plain")[0], "of all cells, not of the picture's"
+    assert "median 0.050, 90 % below 0.300 m" in texts(surface(of_all), "plain")[0], (
+        "of all cells, not of the picture's"
+    )
     assert [part.title for part in section.elements if isinstance(part, Figure)][0] == "Surface model"
     assert ground_of(mapped).source == "the surface model"
     assert covered(mapped, None) == "495 m²"
