@@ -71,7 +71,7 @@ class GeoTiffSettings:
 
         Heights have NODATA where there is nothing; colours have a fourth channel that is 0 there and 255 elsewhere;
         shades are 1 to 255, and 0 where there is nothing; so are numbers, of 32 bits. Counts are 0 and more,
-        of 16 bits, whatever the kind is called, and NO_COUNT where there is nothing.
+        of 16 bits, and NO_COUNT where there is nothing.
         """
         import rasterio
 

@@ -143,9 +143,7 @@ class Raster:
         place = west, grid.gsd, 0.0, north, 0.0, -grid.gsd
         ElementTree.SubElement(root, "GeoTransform").text = ", ".join(map(repr, place))
         tiles = sorted(self.folder.glob("*.tif"))
-        kind = {"float32": "Float32", "float64": "Float64", "uint8": "Byte", "uint16": "UInt16", "uint32": "UInt32"}[
-            self.dtype
-        ]
+        kind = GDAL_TYPES[self.dtype]
         for channel, color in enumerate(CHANNELS[self.kind], 1):
             band = ElementTree.SubElement(root, "VRTRasterBand", dataType=kind, band=str(channel))
             if self.nodata is not None:
