@@ -24,7 +24,13 @@ from surfkit.apps.quality.report import document_of
 from surfkit.apps.quality.sections.calibration import radial_distortion
 from surfkit.apps.quality.sections.maps_section import covered, surface
 from surfkit.apps.quality.sections.residuals import control, positions
-from surfkit.apps.quality.sections.summary import Findings, focal_warnings, ground_sampling_distance, warnings
+from surfkit.apps.quality.sections.summary import (
+    Findings,
+    focal_warnings,
+    ground_sampling_distance,
+    meaning,
+    warnings,
+)
 from surfkit.apps.quality.sections.tie_point_section import MIN_CELL_OBSERVATIONS, errors_of, mean_residuals
 from surfkit.apps.quality.sparse_model import SparseModel
 from surfkit.apps.quality.survey import open_survey
@@ -294,6 +300,12 @@ def test_maps_are_measured_and_drawn(survey, tmp_path):
     assert [part.title for part in section.elements if isinstance(part, Figure)][0] == "Surface model"
     assert ground_of(mapped).source == "the surface model"
     assert covered(mapped, None) == "495 m²"
+
+
+def test_what_is_resolved_is_what_the_coarser_of_photographs_and_maps_is(survey):
+    assert "4 cm (two pixels)" in meaning(replace(survey, maps={}), 0.02)
+    assert "16 cm (two cells of the maps)" in meaning(replace(survey, maps={"gsd": 0.08}), 0.02)
+    assert "two pixels" in meaning(replace(survey, maps={"gsd": 0.02}), 0.02)
 
 
 def test_a_data_set_that_tells_little_says_what_is_missing(survey):

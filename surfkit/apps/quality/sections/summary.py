@@ -162,7 +162,10 @@ def meaning(survey: Survey, distance: float | None) -> str:
             "Without positions or control points the scale is unknown: no lengths can be taken from the result."
         )
     if distance is not None:
-        said.append(f"Details smaller than about {length(2 * distance, survey.unit)} (two pixels) are not resolved.")
+        cell = number(survey.maps, "gsd") or 0.0  # photographs may have been read smaller than they are
+        what = "two cells of the maps" if cell > distance else "two pixels"
+        least = length(2 * max(distance, cell), survey.unit)
+        said.append(f"Details smaller than about {least} ({what}) are not resolved.")
     return " ".join(said) or "Nothing is known of how exact the result is."
 
 
