@@ -82,7 +82,7 @@ def test_without_both_letters_half_a_turn_is_left_open_unless_a_system_decides()
 def test_a_wrong_letter_is_refused():
     found, _ = decided(photographs(east=-1.0))
     assert isinstance(found, NoSimilarity)
-    assert "upside down, 40 m below" in found.reason and "view 90 degrees" in found.reason
+    assert "fit mirrored only" in found.reason and "have a wrong sign" in found.reason
 
 
 def test_cameras_that_fit_no_sign():
