@@ -82,7 +82,7 @@ def forecast(
             scene, load = _scene(data, examined, load, Path(folder))
         except BadInput as error:
             return None, from_errors("probe", [error])
-        pixels = sum(w * h for w, h in _sizes(data, examined, {s.name for s in examined.gathered.train}))
+        pixels = sum(w * h for w, h in read_sizes(data, examined, {s.name for s in examined.gathered.train}))
         first = recipe.start.expected(len(scene.cloud.xyz), pixels)
         rising = growth(recipe.pretrain, first, pixels, plan.points, recipe.start.is_dense)
         parts = schedule(recipe.pretrain.steps, rising)
@@ -135,7 +135,7 @@ def _free_disk(path: Path) -> int:
     return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free
 
 
-def _sizes(data: Data, examined: ExaminedData, names: set[str]) -> list[tuple[int, int]]:
+def read_sizes(data: Data, examined: ExaminedData, names: set[str]) -> list[tuple[int, int]]:
     """Widths and heights at which photographs will be used, once for each view that they give."""
     shots, known = examined.gathered.capture.shots, examined.photographs
     looks = [(shot, known[shot.name]) for shot in shots if shot.name in names and shot.name in known]
@@ -156,9 +156,9 @@ def _load(data: Data, recipe: Recipe, examined: ExaminedData, plan: ProbePlan) -
     train = {shot.name for shot in gathered.train}
     losses = recipe.pretrain.losses
     priors = _with_maps(data, examined, recipe) if needs_priors(losses) else set()
-    view_bytes = 3 * sum(w * h for w, h in _sizes(data, examined, train))
-    view_bytes += sum(w * h for w, h in _sizes(data, examined, train & set(gathered.masks)))
-    view_bytes += prior_bytes(needs_normals(losses)) * sum(w * h for w, h in _sizes(data, examined, train & priors))
+    view_bytes = 3 * sum(w * h for w, h in read_sizes(data, examined, train))
+    view_bytes += sum(w * h for w, h in read_sizes(data, examined, train & set(gathered.masks)))
+    view_bytes += prior_bytes(needs_normals(losses)) * sum(w * h for w, h in read_sizes(data, examined, train & priors))
     bent = sum(not is_pinhole(shot.camera) for shot in gathered.capture.shots)
     kept = [*cache_folder(data.path).glob("*.png"), *place(data.path, PANORAMAS).glob("*-front.png")] if bent else []
     there = sum(not path.stem.endswith("-mask") for path in kept)

@@ -15,8 +15,8 @@ from surfkit.apps.doctor.estimate import (
 )
 from surfkit.apps.doctor.examine import ExaminedData, examine
 from surfkit.apps.doctor.finding import Finding
-from surfkit.apps.doctor.forecast import ProbePlan, forecast
-from surfkit.apps.make.quality import QUALITIES, Quality, QualityName
+from surfkit.apps.doctor.forecast import ProbePlan, forecast, read_sizes
+from surfkit.apps.make.quality import FIXED_SECONDS, QUALITIES, Quality, QualityName
 from surfkit.apps.make.record import Decisions, Forecast
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -70,7 +70,9 @@ def decide(data: Data, name: QualityName, steps: int | None, device: Device, out
         if finding.level == "warning" and finding.what not in SEPARATE_FINDINGS:
             say(f"{finding.level}: {finding.text}")
     # One continuous surface is what a client can use; its cut is compiled code.
-    return replace(chosen(quality, found, count, length), mesher=None if native.module() is None else CLOSED)
+    pixels = sum(w * h for w, h in read_sizes(data, examined, {shot.name for shot in examined.gathered.train}))
+    decided = chosen(quality, found, count, length, pixels / 1e6)
+    return replace(decided, mesher=None if native.module() is None else CLOSED)
 
 
 def _forecast(
@@ -83,7 +85,9 @@ def _forecast(
     return found, told
 
 
-def chosen(quality: Quality, found: ResourceEstimate | None, photographs: int, steps: int) -> Decisions:
+def chosen(
+    quality: Quality, found: ResourceEstimate | None, photographs: int, steps: int, megapixels: float = 0.0
+) -> Decisions:
     """The recipe by its rule: blocks where one model needs more memory than can be used.
 
     Args:
@@ -91,13 +95,14 @@ def chosen(quality: Quality, found: ResourceEstimate | None, photographs: int, s
         found: What a run of one model will take; None where it could not be measured.
         photographs: That are trained on.
         steps: Of optimisation.
+        megapixels: Of all these photographs, as they are read.
 
     Raises:
         BadInput: Not even the coarse model that blocks begin with has room.
     """
     if found is None:
         return Decisions(quality.recipe, "one model, as its memory could not be forecast", photographs, steps)
-    other = None if found.gpu is not None else round(quality.other_steps * photographs * found.seconds / steps, 1)
+    other = None if found.gpu is not None else round(FIXED_SECONDS + quality.megapixel_seconds * megapixels, 1)
     told = Forecast(round(found.seconds, 1), found.memory_bytes, found.run_bytes, other)
     need, usable, where = _tightest(found)
     rule = f"needs {size(need)} of {where} without photographs, and {size(usable)} (90 % of what is free) can be used"
@@ -165,7 +170,7 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
         whole = f"about {duration(told.seconds)} for the steps of optimisation; {later} come on top"
         if told.other_seconds is not None:
             whole = f"about {duration(told.seconds + told.other_seconds)}: {duration(told.seconds)} for the steps of "
-            whole += f"optimisation, as measured, and a guess within a factor of 2 for {later}"
+            whole += f"optimisation, as measured, and a guess within a factor of 3 for {later}"
         found.append(("time", whole))
         found.append(("memory", f"{size(told.memory_bytes)} for the optimisation; making the mesh may take more"))
         found.append(("disk", f"{size(told.disk_bytes)} for the model; {later} come on top"))

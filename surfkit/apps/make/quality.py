@@ -13,6 +13,8 @@ QualityName = Literal["draft", "normal", "high"]
 DRAFT_STEPS = 500
 """Steps of a first look, as `surfkit doctor` recommends it."""
 DRAFT_LONGEST_PX = 800
+FIXED_SECONDS = 50.0
+"""What all steps beside the optimisation take of even the smallest survey."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +27,8 @@ class Quality:
         at_most: Most steps.
         times: By which the usual number of steps is multiplied.
         divides: Whether the scene is divided into blocks where one model cannot hold it.
-        other_steps: Optimisation steps on a CPU that take as long as all else for one photograph: depth maps, mesh,
-            texture, maps and reports. All of it grows with the pixels, as a step does. Measured on two surveys, which
-            differ by a factor of 2 (bench/log/field.md).
+        megapixel_seconds: What a megapixel of the photographs takes on 2 cores beside the optimisation: depth maps,
+            mesh, texture, maps and reports. Measured on two surveys (bench/log/field.md).
     """
 
     recipe: str
@@ -35,7 +36,7 @@ class Quality:
     at_most: int | None = None
     times: int = 1
     divides: bool = True
-    other_steps: float = 25.0
+    megapixel_seconds: float = 20.0
 
     def reading(self, given: ReadSettings) -> ReadSettings:
         """How photographs are read: at the size of the preset, unless the user has given one."""
@@ -59,7 +60,7 @@ class Quality:
 
 QUALITIES: dict[QualityName, Quality] = {
     # At its 5 pixels between points a draft is so small that no memory is too small for it.
-    "draft": Quality("surface-short", DRAFT_LONGEST_PX, at_most=DRAFT_STEPS, divides=False),
+    "draft": Quality("surface-short", DRAFT_LONGEST_PX, DRAFT_STEPS, divides=False, megapixel_seconds=12.0),
     "normal": Quality("surface", DEFAULT_LONGEST_PX),
     "high": Quality("surface", None, times=2),
 }

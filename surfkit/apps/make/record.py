@@ -44,7 +44,8 @@ class Forecast:
         seconds: Of the optimisation.
         memory_bytes: The same.
         disk_bytes: Of the model.
-        other_seconds: Of depth maps, mesh, texture, maps and reports, as `Quality.other_steps` has it; None on a GPU.
+        other_seconds: Of depth maps, mesh, texture, maps and reports, as `Quality.megapixel_seconds` has it; None on a
+            GPU.
     """
 
     seconds: float

@@ -6,7 +6,7 @@ import pytest
 
 from surfkit.apps.doctor.estimate import GpuEstimate, MachineLimits
 from surfkit.apps.make.plan import chosen, recipe_of, rows
-from surfkit.apps.make.quality import QUALITIES
+from surfkit.apps.make.quality import FIXED_SECONDS, QUALITIES
 from surfkit.apps.make.record import Decisions
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -75,10 +75,9 @@ def test_the_mesh_that_is_delivered_is_closed_and_as_fine_as_that_of_the_recipe(
 
 
 def test_the_time_of_all_steps_is_told_beforehand_on_a_cpu():
-    found = chosen(QUALITIES["normal"], estimated(), 40, 100)
+    found = chosen(QUALITIES["normal"], estimated(), 40, 100, megapixels=30.0)
     assert found.forecast is not None
-    others = QUALITIES["normal"].other_steps * 40 * found.forecast.seconds / 100
-    assert found.forecast.other_seconds == pytest.approx(others, abs=0.1)
+    assert found.forecast.other_seconds == FIXED_SECONDS + 30 * QUALITIES["normal"].megapixel_seconds
     told = dict(rows(found))["time"]
     assert told.startswith("about ") and "guess" in told and "come on top" not in told
     longer = found.longer(300).forecast
