@@ -151,7 +151,10 @@ def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:
     }
     cameras = {
         name: CameraNumbers(
-            *(tuple(numbers[part].tolist()) for part in (FALLOFF, CENTRE, CURVE)), mean_falloff(numbers, lenses[name])
+            falloff=tuple(numbers[FALLOFF].tolist()),
+            centre=tuple(numbers[CENTRE].tolist()),
+            curve=tuple(numbers[CURVE].tolist()),
+            mean=mean_falloff(numbers, lenses[name]),
         )
         for name, numbers in zip(names, light.cameras, strict=True)
     }
