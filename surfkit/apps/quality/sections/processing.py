@@ -72,10 +72,8 @@ def processing(survey: Survey) -> Section:
                 if value is not None and name not in HIDDEN
             ]
             elements.append(facts(title, rows, "Those that are given, or have a default."))
-    steps = mapping(survey.delivery, "steps")
-    of_steps = (
-        f"{name}: {note}" for name in steps if name != "surface" for note in texts(mapping(steps, name), "notes")
-    )
+    made = mapping(survey.delivery, "steps")  # notes of the surface are those of the run
+    of_steps = (f"{name}: {note}" for name in made if name != "surface" for note in texts(mapping(made, name), "notes"))
     notes = [
         *texts(survey.record, "notes"),
         *of_steps,
