@@ -69,9 +69,9 @@ def decide(data: Data, name: QualityName, steps: int | None, device: Device, out
     for finding in (*told, *more_told):
         if finding.level == "warning" and finding.what not in SEPARATE_FINDINGS:
             say(f"{finding.level}: {finding.text}")
-    # One continuous surface is what a client can use; its cut is compiled code.
     pixels = sum(w * h for w, h in read_sizes(data, examined, {shot.name for shot in examined.gathered.train}))
     decided = chosen(quality, found, count, length, pixels / 1e6)
+    # One continuous surface is what a client can use; its cut is compiled code.
     return replace(decided, mesher=None if native.module() is None else CLOSED)
 
 

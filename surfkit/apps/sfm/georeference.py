@@ -73,6 +73,7 @@ class Placement:
         handed: Whether they are told from their mirror image: they are not all in a plane.
         plan: Whether the positions had no altitudes: heights are then above the middle of the ground, and those in
             `onto` are of the cameras.
+        drifting: Positions without a stated accuracy that contradict the others a little, and count all the same.
     """
 
     chart: MapProjection
@@ -83,6 +84,7 @@ class Placement:
     sigma: np.ndarray
     handed: bool = False
     plan: bool = False
+    drifting: int = 0
 
 
 @dataclass(frozen=True)
@@ -200,8 +202,8 @@ def _fitted(
     silent = np.isnan(stated[:, 0])
     assumed = np.where(silent, ASSUMED_M / chart.metres, np.linalg.norm(stated[:, :axes], axis=1) / np.sqrt(axes))
     sigma, least = None if silent.all() else assumed, np.full(len(known), NEAR_M / chart.metres)
-    fit = fit_robustly(xyz, onto, sigma, seed, least)
-    if fit is not None and _drifts(fit, silent, ASSUMED_M / chart.metres):
+    fit, drifting = fit_robustly(xyz, onto, sigma, seed, least), 0
+    if fit is not None and (drifting := _drifting(fit, silent, ASSUMED_M / chart.metres)):
         fit = fit_robustly(xyz, onto, sigma, seed, np.where(silent, ASSUMED_M / chart.metres, least))
     if fit is None:
         return NoSimilarity(f"of {len(known)} positions fewer than {MIN_AGREEING_POSITIONS} agree with the cameras")
@@ -227,13 +229,16 @@ def _fitted(
         )
     own = np.maximum(fit.deviation(silent), MIN_SIGMA_M / chart.metres)
     sigma = np.where(silent[:, None], own, stated)
-    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right)
+    return Placement(
+        chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right, drifting=drifting
+    )
 
 
-def _drifts(fit: SimilarityFit, silent: np.ndarray, reach: float) -> bool:
-    """Whether many of the positions that state no accuracy contradict the others by a little."""
+def _drifting(fit: SimilarityFit, silent: np.ndarray, reach: float) -> int:
+    """How many of the positions that state no accuracy contradict the others by a little; 0 where these are few."""
     near = np.linalg.norm(fit.residuals, axis=1) <= reach
-    return bool((silent & near & ~fit.inside).sum() > MAX_WRONG_SHARE * silent.sum())
+    count = int((silent & near & ~fit.inside).sum())
+    return count if count > MAX_WRONG_SHARE * silent.sum() else 0
 
 
 def _in_plan(

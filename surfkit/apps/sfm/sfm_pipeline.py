@@ -26,7 +26,7 @@ from surfkit.apps.sfm.focal import (
     weighed,
     with_focals_held,
 )
-from surfkit.apps.sfm.georeference import NoSimilarity, Placement, centres_of
+from surfkit.apps.sfm.georeference import ASSUMED_M, NoSimilarity, Placement, centres_of
 from surfkit.apps.sfm.gravity_alignment import points_of, turn_upright, up_of
 from surfkit.apps.sfm.ground_control import ControlResiduals, doubts, place_by_points
 from surfkit.apps.sfm.inspect_photos import PHOTOGRAPHS_FILE, Photo, known_photographs
@@ -354,7 +354,10 @@ def _alike(before: Sequence[Photo], photos: Sequence[Photo]) -> list[tuple[Photo
 
 
 def _name_wrong(where: Placement) -> None:
-    """Say which positions are left out."""
+    """Say which positions are left out, and how many count though they contradict others."""
+    if where.drifting:
+        said = f"{where.drifting} of {len(where.names)} positions contradict the others by up to {ASSUMED_M:g} m"
+        emit(Warned(f"{said}; they state no accuracy, are taken for GPS without corrections, and count"))
     wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
     far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
     if len(wrong) == 1:

@@ -68,7 +68,7 @@ def test_a_strip_that_a_receiver_without_corrections_put_a_metre_off_is_no_mista
     shots = survey(onto)[0]
     chart = chart_of(np.array([photo.exif.position for photo in photos]), "auto")
     found = place(shots, photos, chart)
-    assert found.fit.inside.all()
+    assert found.fit.inside.all() and found.drifting == 6, "which is told"
     away = found.similarity.points(np.stack(list(shots.values()))) - onto
     np.testing.assert_allclose(away.mean(0), (0.8 / 3, 0.8 / 3, 0), atol=0.1)
     assert (found.sigma[:, :2] > 0.3).all(), "as exact as they agree"
@@ -82,6 +82,7 @@ def test_one_position_two_metres_off_is_still_left_out():
     shots = survey(onto)[0]
     found = place(shots, photos, chart_of(np.array([photo.exif.position for photo in photos]), "auto"))
     assert [name for name, good in zip(found.names, found.fit.inside, strict=True) if not good] == ["7.jpg"]
+    assert found.drifting == 0
 
 
 def test_a_line_determines_no_turn():
