@@ -71,8 +71,10 @@ def decide(data: Data, name: QualityName, steps: int | None, device: Device, out
             say(f"{finding.level}: {finding.text}")
     pixels = sum(w * h for w, h in read_sizes(data, examined, {shot.name for shot in examined.gathered.train}))
     decided = chosen(quality, found, count, length, pixels / 1e6)
-    # One continuous surface is what a client can use; its cut is compiled code.
-    return replace(decided, mesher=None if native.module() is None else CLOSED)
+    if native.module() is None:
+        say(f"the mesh is that of the recipe: mesh:{CLOSED}, which is closed, needs the compiled part of surfkit")
+        return decided
+    return replace(decided, mesher=CLOSED)  # one continuous surface is what a client can use
 
 
 def _forecast(
