@@ -20,7 +20,7 @@ import numpy as np
 
 from surfkit.apps.sfm.bundle_adjustment import MAX_ERROR_RATIO, mean_error, taken_over
 from surfkit.apps.sfm.control_list import MIN_CONTROL_POINTS, GroundControl
-from surfkit.apps.sfm.control_marks import WrongMark, images_of, located, triangulate, without_wrong_marks
+from surfkit.apps.sfm.control_marks import WrongMark, images_of, located, size_ratio, triangulate, without_wrong_marks
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.focal import known_focals
 from surfkit.apps.sfm.georeference import NEAR_M, MapProjection, NoSimilarity, centres_of, place
@@ -30,6 +30,7 @@ from surfkit.apps.sfm.mapping import read_model
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS
 from surfkit.apps.sfm.survey_observations import Adjusted, CameraPositions, SurveyedPoint, Weights, adjust_together
+from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.files import replacing_folder
 
@@ -73,9 +74,20 @@ def tie_sigma(model: Any) -> float:
 
 
 def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[GroundControl, list[WrongMark]]:
-    """The points without marks that contradict the others of their point in a model, and these marks."""
-    sigma = float(np.hypot(settings.mark_sigma, tie_sigma(model)))
-    points, wrong = without_wrong_marks(images_of(model), ground.points, sigma)
+    """The points without marks that contradict the others of their point in a model, and these marks.
+
+    Raises:
+        BadInput: The marks are those of photographs of another size.
+    """
+    sigma, images = float(np.hypot(settings.mark_sigma, tie_sigma(model))), images_of(model)
+    if (ratio := size_ratio(images, ground.points)) is not None:
+        width, height = max((image.camera.width, image.camera.height) for image in images.values())
+        raise BadInput(
+            f"--gcp {settings.gcp}: its pixels fit photographs of about {ratio * width:.0f} x {ratio * height:.0f}, "
+            f"and those of the folder have {width} x {height}; were they made smaller or larger? Multiply the pixels by "
+            f"{1 / ratio:.4g}, or prepare the photographs in which the points were marked"
+        )
+    points, wrong = without_wrong_marks(images, ground.points, sigma)
     return replace(ground, points=points), wrong
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from surfkit.apps.sfm.control_list import MIN_POINT_PHOTOS, GroundControlPoint
 from surfkit.core.codec import write_text
@@ -18,6 +19,13 @@ MAX_ROUND_TRIP_PX = 0.1
 """A place whose pixel leads back to another ray, by more than this, is outside of what a lens model describes."""
 STEP_SHARE = 1e-5
 """Of the distance of a point: steps of the differences by which its residuals change."""
+RESIZED_SHARE, MIN_RESIZED = 0.2, 1.15
+"""Marks are of photographs of another size where, at that size, residuals are at most this share of those as given,
+and the sizes differ by this factor or more: a wrong mark here and there does not fit better at any size."""
+RESIZED_RANGE, RESIZED_STEPS = 16.0, 161
+"""Factors of size that are tried: from one over this to this, in so many steps."""
+MIN_RESIZED_ERROR = 0.005
+"""Marks that are off by less than this share of the width of the photographs are of their size."""
 MIN_REDUNDANCY = 1e-3
 """A direction in which the other marks say less of a mark is not looked at."""
 Images = Mapping[str, Any]
@@ -103,6 +111,39 @@ def without_wrong_marks(
     return kept, wrong
 
 
+def size_ratio(images: Images, points: Sequence[GroundControlPoint]) -> float | None:
+    """How many times as large as these photographs those are in which the points were marked; None where the marks fit
+    these, or fit no size: a list is often made on photographs that were made smaller.
+
+    Args:
+        images: Of the model.
+        points: With marks.
+    """
+    as_given, width = _error_at(images, points, 1.0), max(image.camera.width for image in images.values())
+    if not MIN_RESIZED_ERROR * width < as_given < np.inf:
+        return None
+    tried = np.geomspace(1 / RESIZED_RANGE, RESIZED_RANGE, RESIZED_STEPS)
+    errors = [_error_at(images, points, float(ratio)) for ratio in tried]
+    best = int(np.argmin(errors))
+    if errors[best] > RESIZED_SHARE * as_given or abs(np.log(tried[best])) < np.log(MIN_RESIZED):
+        return None
+    span = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    found = minimize_scalar(lambda ratio: _error_at(images, points, ratio), bounds=span, method="bounded")
+    return float(found.x)
+
+
+def _error_at(images: Images, points: Sequence[GroundControlPoint], ratio: float) -> float:
+    """Median over points of how far their marks are from where their rays meet (RMS), were they of photographs of
+    `ratio` times the size; pixels of the marks."""
+    errors = []
+    for point in points:
+        marks = {name: (x / ratio, y / ratio) for name, (x, y) in point.marks.items() if name in images}
+        if (xyz := triangulate(images, marks)) is not None:
+            left = list(mark_residuals(images, marks, xyz).values())
+            errors.append(ratio * float(np.sqrt(np.square(left).sum(1).mean())) if len(left) == len(marks) else np.inf)
+    return float(np.median(errors)) if errors else np.inf
+
+
 def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     """By how much the sum of squared residuals of three or more marks falls without each of them, pixels squared.
 
@@ -164,6 +205,8 @@ def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, floa
         if (image := images.get(name)) is None:
             continue
         direction = np.append(np.asarray(image.camera.cam_from_img(np.array([pixel], np.float64))).ravel()[:2], 1.0)
+        if not np.isfinite(direction).all():
+            continue  # outside of what its lens model describes
         direction = np.array(image.cam_from_world().rotation.matrix()).T @ direction
         rays.append((np.array(image.projection_center()), direction / np.linalg.norm(direction)))
     if len(rays) < MIN_POINT_PHOTOS:

@@ -11,7 +11,7 @@ from flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly, reconstructed
 from surfkit.apps.sfm.bundle_adjustment import adjust
 from surfkit.apps.sfm.control_adjustment import adjust_to_points, adjust_to_points_once, clean_marks
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint, read_ground, read_list
-from surfkit.apps.sfm.control_marks import images_of, projected, without_wrong_marks
+from surfkit.apps.sfm.control_marks import images_of, projected, size_ratio, without_wrong_marks
 from surfkit.apps.sfm.control_report import MARK_COLUMNS, POINT_COLUMNS, point_rows, warnings_of, write_tables
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.georeference import MapProjection, centres_of
@@ -195,6 +195,27 @@ def test_two_marks_that_contradict_each_other_both_go(flown):
     (kept,), wrong = without_wrong_marks(images, [two], NOISE_PX)
     assert not kept.marks and [mark.certain for mark in wrong] == [False, False]
     assert sum(mark.pixels for mark in wrong) == pytest.approx(12, abs=3)
+
+
+def test_marks_of_smaller_photographs_are_noticed(flown):
+    _, model = flown
+    images, given = images_of(model), listed(flown[0])
+    assert size_ratio(images, given.points) is None
+    for ratio in (0.5, 0.8, 3.0):
+        other = [replace(p, marks={n: (ratio * x, ratio * y) for n, (x, y) in p.marks.items()}) for p in given.points]
+        assert size_ratio(images, other) == pytest.approx(ratio, rel=0.01)
+    with pytest.raises(BadInput, match=rf"about 9[56]\d x 7[12]\d.* {WIDTH} x {HEIGHT}; .*by 0.33"):
+        clean_marks(model, replace(given, points=other), SETTINGS)
+
+
+def test_marks_that_fit_at_no_size_are_of_these_photographs(flown):
+    _, model = flown
+    images, draw = images_of(model), np.random.default_rng(2)
+    anywhere = [
+        replace(point, marks={name: tuple(draw.uniform(0, (WIDTH, HEIGHT)).tolist()) for name in point.marks})
+        for point in listed(flown[0]).points
+    ]
+    assert size_ratio(images, anywhere) is None
 
 
 def test_positions_of_photographs_keep_their_common_error(flown, tmp_path):
