@@ -84,7 +84,7 @@ def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[
         width, height = max((image.camera.width, image.camera.height) for image in images.values())
         raise BadInput(
             f"--gcp {settings.gcp}: its pixels fit photographs of about {ratio * width:.0f} x {ratio * height:.0f}, "
-            f"and those of the folder have {width} x {height}; were they made smaller or larger? Multiply the pixels by "
+            f"and those of the folder have {width} x {height}; were they resized? Multiply the pixels by "
             f"{1 / ratio:.4g}, or prepare the photographs in which the points were marked"
         )
     points, wrong = without_wrong_marks(images, ground.points, sigma)
