@@ -30,7 +30,7 @@ from surfkit.apps.sfm.mapping import read_model
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS
 from surfkit.apps.sfm.survey_observations import Adjusted, CameraPositions, SurveyedPoint, Weights, adjust_together
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.files import replacing_folder
 
@@ -89,6 +89,12 @@ def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[
         )
     points, wrong = without_wrong_marks(images, ground.points, sigma)
     return replace(ground, points=points), wrong
+
+
+def said_of(wrong: Sequence[WrongMark]) -> str:
+    """Which points have marks that contradict the others, as the end of a message; nothing where none has."""
+    names = list(dict.fromkeys(mark.point for mark in wrong))
+    return f". Marks that contradict each other are left out of {few(names)}" if names else ""
 
 
 def adjust_to_points_once(

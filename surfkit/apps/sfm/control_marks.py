@@ -40,13 +40,13 @@ class WrongMark:
         point: Name of the point.
         photograph: Where it is marked.
         pixels: How far it is from where the others put it; with two marks, by which neither is told to be wrong, how
-            far each is from where their rays come nearest to each other.
+            far each is from where their rays come nearest to each other; None where that is behind the photograph.
         certain: Whether the others agree without it, so that it is this one; not so with two marks.
     """
 
     point: str
     photograph: str
-    pixels: float
+    pixels: float | None
     certain: bool
 
 
@@ -81,7 +81,8 @@ def without_wrong_marks(
     """Points without the marks that contradict the others of their point, and these marks.
 
     Surveyed places have no say. As long as one contradicts, the mark goes without which the sum of squares falls most
-    (data snooping; Baarda, 1968). Two marks that contradict each other both go.
+    (data snooping; Baarda, 1968). Two marks that contradict each other both go, and all whose rays meet behind a
+    photograph, whichever is left out.
 
     Args:
         images: Of the model.
@@ -93,20 +94,23 @@ def without_wrong_marks(
     for point in points:
         marks = {name: pixel for name, pixel in point.marks.items() if name in images}
         gone: list[str] = []
-        while len(marks) > MIN_POINT_PHOTOS and (drops := _drops(images, marks)):
-            name = max(drops, key=lambda one: drops[one])
-            if drops[name] <= limit:
+        while len(marks) > MIN_POINT_PHOTOS:
+            drops = _drops(images, marks) or _misled(images, marks)
+            name = max(drops, key=lambda one: drops[one], default="")
+            if not drops or drops[name] <= limit:
                 break
             gone.append(name)
             del marks[name]
         xyz = triangulate(images, marks)
         left = {} if xyz is None else mark_residuals(images, point.marks, xyz)
-        certain = not (
+        meets = len(marks) < MIN_POINT_PHOTOS or marks.keys() <= left.keys()
+        certain = meets and not (
             len(marks) == MIN_POINT_PHOTOS
             and sum(float(left[name] @ left[name]) for name in left if name in marks) > limit
         )
         gone += [] if certain else list(marks)
-        wrong += [WrongMark(point.name, name, float(np.linalg.norm(left.get(name, np.nan))), certain) for name in gone]
+        off = {name: float(np.linalg.norm(rest)) for name, rest in left.items()}
+        wrong += [WrongMark(point.name, name, off.get(name), certain) for name in gone]
         kept.append(replace(point, marks={name: at for name, at in point.marks.items() if name not in gone}))
     return kept, wrong
 
@@ -165,6 +169,19 @@ def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str
         name: float(rest[part] @ np.linalg.pinv(spare[part, part], rcond=MIN_REDUNDANCY) @ rest[part])
         for name, part in parts.items()
     }
+
+
+def _misled(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Of marks whose rays meet behind a photograph, those without which the others meet in front of theirs: infinite
+    for the one that leaves the least residuals."""
+    squares = {}
+    for name in marks:
+        others = {other: pixel for other, pixel in marks.items() if other != name}
+        xyz = triangulate(images, others)
+        left = {} if xyz is None else mark_residuals(images, others, xyz)
+        if others.keys() <= left.keys():
+            squares[name] = sum(float(rest @ rest) for rest in left.values())
+    return {min(squares, key=lambda name: squares[name]): np.inf} if squares else {}
 
 
 def _slope(images: Images, marks: Mapping[str, tuple[float, float]], xyz: np.ndarray) -> np.ndarray | None:

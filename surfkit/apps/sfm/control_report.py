@@ -37,9 +37,10 @@ def warnings_of(where: ControlResiduals) -> Iterator[str]:
     """What is left out, a line for each kind."""
     sure = [mark for mark in where.wrong_marks if mark.certain]
     for mark in sure[:LISTED_MARKS]:
+        off = "behind it" if mark.pixels is None else f"{mark.pixels:.1f} px away"
         yield (
-            f"the mark of {mark.point!r} in {mark.photograph!r} is {mark.pixels:.1f} px from where its marks in other "
-            "photographs put it, and is left out"
+            f"the mark of {mark.point!r} in {mark.photograph!r} is left out: by the marks in other photographs the "
+            f"point is {off}"
         )
     if len(sure) > LISTED_MARKS:
         yield f"{len(sure) - LISTED_MARKS} more marks are left out: see wrong_marks in the report"
@@ -48,9 +49,11 @@ def warnings_of(where: ControlResiduals) -> Iterator[str]:
         if not mark.certain:
             pairs.setdefault(mark.point, []).append(mark)
     for point, marks in pairs.items():
+        known = [mark.pixels for mark in marks if mark.pixels is not None]
+        how = f"by {sum(known):.1f} px" if len(known) == len(marks) else "as their rays do not meet in front of them"
         yield (
-            f"the marks of {point!r} in {few([mark.photograph for mark in marks])} contradict each other, by "
-            f"{sum(mark.pixels for mark in marks):.1f} px, and are left out; a third mark would tell which is wrong"
+            f"the marks of {point!r} in {few([mark.photograph for mark in marks])} contradict each other, {how}, and "
+            "are left out; one more mark would tell which is wrong"
         )
     if where.wrong:
         away = {name: float(np.linalg.norm(where.residuals[name])) for name in where.wrong}

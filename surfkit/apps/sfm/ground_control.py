@@ -24,7 +24,11 @@ from surfkit.apps.sfm.georeference import (
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.similarity import MIN_AGREEING_POSITIONS, PARAMETERS, fit_robustly, umeyama
 from surfkit.apps.sfm.survey_plausibility import MAX_ALTITUDE_ERROR_M, MAX_POSITION_ERROR_M, MIN_LAND_M, Handedness
+from surfkit.core.check import few
 from surfkit.io.datasets.topocentric import Similarity
+
+STATED_TIMES = 3.0
+"""Residuals of a coordinate up to so many times the stated standard deviation are as good as the points are."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class ControlResiduals:
         places: By name, (3,) the place on the list less the offset, units of the map.
         marks: By name of the point and of the photograph, the mark less the pixel of the triangulated point.
         wrong_marks: Those left out.
+        turn_error: Standard error of the scale and the turn of the similarity, as a share.
         adjustment: What the report says of the bundle adjustment with the points; empty without one.
     """
 
@@ -57,6 +62,7 @@ class ControlResiduals:
     places: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     marks: Mapping[str, Mapping[str, tuple[float, float]]] = field(default_factory=dict)
     wrong_marks: tuple[WrongMark, ...] = ()
+    turn_error: float = 0.0
     adjustment: Mapping[str, Any] = field(default_factory=dict)
 
     def facts(self) -> dict[str, Any]:
@@ -101,7 +107,7 @@ class ControlResiduals:
 
 
 def place_by_points(
-    model: Any, ground: GroundControl, held_back: int, named: Sequence[str] = ()
+    model: Any, ground: GroundControl, held_back: int, named: Sequence[str] = (), sigma_m: float = 0.0
 ) -> ControlResiduals | NoSimilarity:
     """The similarity that brings control points to their places.
 
@@ -110,6 +116,7 @@ def place_by_points(
         ground: The points.
         held_back: How many are checkpoints, spread over the list.
         named: Names of checkpoints, instead of so many.
+        sigma_m: Stated standard deviation of each surveyed coordinate, metres.
     """
     points, chart, onto = ground.points, ground.chart, ground.onto
     images = images_of(model)
@@ -147,13 +154,17 @@ def place_by_points(
             f"ground control points fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m; x must be east and y "
             "north, and heights count up"
         )
-    residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
-    rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
-    across = given.scale * sizes[1] * chart.metres
-    if rms / np.sqrt(3) > MAX_TURN_ERROR * across:
+    used = [seen.index(at) for at, good in zip(control, inside, strict=True) if good]
+    rms = float(np.sqrt((left[used] ** 2).sum() / (3 * max(len(used) - PARAMETERS, 1))))
+    along, across = given.scale * sizes[:2] * chart.metres
+    if rms > MAX_TURN_ERROR * across and rms > STATED_TIMES * sigma_m:
+        worst = sorted(used, key=lambda at: -float(np.linalg.norm(left[at])))
+        said = few([f"{points[seen[at]].name} ({np.linalg.norm(left[at]):.1f} m)" for at in worst])
         return NoSimilarity(
-            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points; are the marks on the "
-            "points and in these photographs, and the coordinates in the system that the list names?"
+            f"residuals of {rms:.1f} m a coordinate are too large for {len(used)} ground control points that spread by "
+            f"{along / np.sqrt(len(used)):.0f} and {across / np.sqrt(len(used)):.0f} m: {said}. Are the marks on the "
+            "points and in these photographs, and the coordinates in the system that the list names? If the points "
+            f"were surveyed no better, add --gcp-sigma {rms:.1f}"
         )
     return ControlResiduals(
         chart,
@@ -165,6 +176,7 @@ def place_by_points(
         unseen,
         hand.right,
         {point.name: tuple(row) for point, row in zip(points, onto.tolist(), strict=True)},
+        turn_error=float(rms / across),
     )
 
 
@@ -177,6 +189,11 @@ def doubts(control: ControlResiduals, centres: Mapping[str, np.ndarray], photos:
         photos: With or without positions.
     """
     found, metres = [], control.chart.metres
+    if control.turn_error > MAX_TURN_ERROR:
+        found.append(
+            f"the ground control points agree so little that scale and tilt of the scene are known to "
+            f"{100 * control.turn_error:.0f} % only"
+        )
     low = float(np.median(control.similarity.points(np.stack(list(centres.values())))[:, 2])) * metres
     if low < MIN_LAND_M:
         found.append(

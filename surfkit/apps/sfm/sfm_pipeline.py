@@ -13,7 +13,7 @@ import torch
 
 from surfkit.apps.sfm.bundle_adjustment import adjust_once
 from surfkit.apps.sfm.colmap_database import matched
-from surfkit.apps.sfm.control_adjustment import adjust_to_points_once, clean_marks
+from surfkit.apps.sfm.control_adjustment import adjust_to_points_once, clean_marks, said_of
 from surfkit.apps.sfm.control_list import GroundControl, read_ground
 from surfkit.apps.sfm.control_report import warnings_of, write_tables
 from surfkit.apps.sfm.dataset_export import deliver
@@ -108,10 +108,8 @@ class SfmPreparation:
         motions = {name: motion for *_, rolling in reversed(placed) for name, motion in rolling.motions.items()}
         stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources, motions))
         first, where, *_ = placed[0]
-        points, listed = (
-            where if isinstance(where, ControlResiduals) else None,
-            site if isinstance(site, GroundControl) else None,
-        )
+        points = where if isinstance(where, ControlResiduals) else None
+        listed = site if isinstance(site, GroundControl) else None
         write_tables(self.scene, first, points, listed)
         names = [set(centres_of(model)) for model, *_ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
@@ -229,7 +227,7 @@ class SfmPreparation:
                 model.transform(_sim3d(where.similarity))
                 return self._adjusted_to_points(number, model, replace(where, wrong_marks=tuple(wrong)), site, photos)
             if number == 0:  # smaller ones may show none of the points
-                raise BadInput(f"--gcp {self.settings.gcp}: {where.reason}; correct the list, or leave it out")
+                raise BadInput(f"--gcp {self.settings.gcp}: {where.reason}{said_of(wrong)}")
         elif isinstance(site, PositionHypothesis):
             held = {name for name, photo in photos.items() if photo.exif.is_focal_held}
             photos = {photo.name: photo for photo in site.photos}
@@ -301,7 +299,8 @@ class SfmPreparation:
         self, number: int, model: Any, ground: GroundControl, photos: dict[str, Photo]
     ) -> ControlResiduals | NoSimilarity:
         """The model by control points, unless these put it where no survey can be; says what is doubtful."""
-        where = place_by_points(model, ground, self.settings.checkpoints, self.settings.checkpoint_names)
+        given = self.settings
+        where = place_by_points(model, ground, given.checkpoints, given.checkpoint_names, given.gcp_sigma)
         if isinstance(where, NoSimilarity):
             return where
         if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,22 @@ from flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly, reconstructed
 from surfkit.apps.sfm.bundle_adjustment import adjust
 from surfkit.apps.sfm.control_adjustment import adjust_to_points, adjust_to_points_once, clean_marks
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint, read_ground, read_list
-from surfkit.apps.sfm.control_marks import images_of, projected, size_ratio, without_wrong_marks
+from surfkit.apps.sfm.control_marks import (
+    images_of,
+    mark_residuals,
+    projected,
+    size_ratio,
+    triangulate,
+    without_wrong_marks,
+)
 from surfkit.apps.sfm.control_report import MARK_COLUMNS, POINT_COLUMNS, point_rows, warnings_of, write_tables
 from surfkit.apps.sfm.engine import load_engine
 from surfkit.apps.sfm.georeference import MapProjection, centres_of
-from surfkit.apps.sfm.ground_control import place_by_points
+from surfkit.apps.sfm.ground_control import ControlResiduals, place_by_points
 from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.survey_observations import CameraPositions, SurveyedPoint, Weights, adjust_together
 from surfkit.core.check import BadInput
+from surfkit.io.datasets.topocentric import Similarity
 from surfkit.scene.earth import from_utm
 
 CHART = MapProjection("EPSG:32633", (500_000.0, 5_800_000.0, 0.0))
@@ -156,7 +165,7 @@ def test_a_wrong_mark_is_named_and_its_point_stays(flown, tmp_path):
     assert mark.pixels == pytest.approx(5, abs=1.5) and photo not in where.marks["G1"]
     assert "G1" in where.control and not where.wrong
     (line,) = warnings_of(where)
-    assert f"mark of 'G1' in '{photo}' is {mark.pixels:.1f} px" in line
+    assert f"mark of 'G1' in '{photo}' is left out" in line and f"{mark.pixels:.1f} px away" in line
     assert off(where) < 0.15
 
 
@@ -216,6 +225,30 @@ def test_marks_that_fit_at_no_size_are_of_these_photographs(flown):
         for point in listed(flown[0]).points
     ]
     assert size_ratio(images, anywhere) is None
+
+
+def test_marks_whose_rays_meet_behind_a_photograph_go(flown):
+    """As of a point that was marked in two photographs the other way round."""
+    _, model = flown
+    point, images = listed(flown[0]).points[4], images_of(model)
+    pairs = ({one: point.marks[other], other: point.marks[one]} for one, other in combinations(sorted(point.marks), 2))
+    swapped = next(pair for pair in pairs if not mark_residuals(images, pair, triangulate(images, pair)))
+    left, right = swapped
+    (kept,), wrong = without_wrong_marks(images, [replace(point, marks=swapped)], NOISE_PX)
+    assert not kept.marks and {mark.photograph for mark in wrong} == {left, right}
+    assert not any(mark.certain for mark in wrong) and all(mark.pixels is None for mark in wrong)
+    assert "contradict each other, as their rays do not meet in front" in "\n".join(warnings_of(control(wrong)))
+    others = dict.fromkeys(sorted(point.marks.keys() - {left})[:2])
+    three = {name: point.marks[name] for name in others} | {left: swapped[left]}
+    (kept,), (mark,) = without_wrong_marks(images, [replace(point, marks=three)], NOISE_PX)
+    assert kept.marks.keys() == others.keys() and mark.certain and mark.photograph == left
+
+
+def control(wrong):
+    """What is known where these marks are wrong."""
+    return ControlResiduals(
+        CHART, Similarity(1.0, np.eye(3), np.zeros(3)), {}, (), (), (), (), True, wrong_marks=tuple(wrong)
+    )
 
 
 def test_positions_of_photographs_keep_their_common_error(flown, tmp_path):

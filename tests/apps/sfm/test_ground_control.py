@@ -191,6 +191,21 @@ def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):
     assert isinstance(found, NoSimilarity) and "too large for" in found.reason
 
 
+def test_points_as_inaccurate_as_stated_place_the_model_and_what_it_is_worth_is_told(tmp_path):
+    places = PLACES + np.random.default_rng(3).normal(0, 1.5, PLACES.shape)
+    ground = read_ground(written(tmp_path / "gcp_list.txt", places=places), "auto", SIZES)
+    found = place_by_points(model(), ground, 0)
+    assert isinstance(found, NoSimilarity)
+    off, said = re.search(r"residuals of ([\d.]+) m a coordinate .*: '(\w+) .*--gcp-sigma", found.reason).groups()
+    assert float(off) == pytest.approx(1.5, rel=0.5)
+    stated = place_by_points(model(), ground, 0, sigma_m=1.5)
+    assert max(stated.residuals, key=lambda name: np.linalg.norm(stated.residuals[name])) == said
+    away = abs(stated.similarity.scale / 10 - 1)
+    assert 0.05 < stated.turn_error < 0.3 and away < 3 * stated.turn_error
+    (doubt,) = doubts(stated, {"0.jpg": np.zeros(3)}, [])
+    assert f"known to {100 * stated.turn_error:.0f} % only" in doubt
+
+
 def test_too_few_points_and_points_on_a_line(tmp_path):
     ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", SIZES)
     with pytest.raises(BadInput, match="9 of its 9 .* 3 .* 7 --checkpoints"):
