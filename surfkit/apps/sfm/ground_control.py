@@ -194,6 +194,11 @@ def doubts(control: ControlResiduals, centres: Mapping[str, np.ndarray], photos:
             f"the ground control points agree so little that scale and tilt of the scene are known to "
             f"{100 * control.turn_error:.0f} % only"
         )
+    if all(float(place[2]) + control.chart.offset[2] == 0 for place in control.places.values()):
+        found.append(
+            "all heights on the list are 0: if they were not surveyed, the heights of the scene are not absolute, and "
+            "ground that is not level tilts it"
+        )
     low = float(np.median(control.similarity.points(np.stack(list(centres.values())))[:, 2])) * metres
     if low < MIN_LAND_M:
         found.append(

@@ -206,6 +206,16 @@ def test_points_as_inaccurate_as_stated_place_the_model_and_what_it_is_worth_is_
     assert f"known to {100 * stated.turn_error:.0f} % only" in doubt
 
 
+def test_heights_that_are_all_0_are_told(tmp_path):
+    ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", SIZES)
+    points = [replace(point, xyz=(*point.xyz[:2], 0.0)) for point in ground.points]
+    flat = replace(ground, points=points, onto=ground.onto * (1, 1, 0) - (0, 0, ground.chart.offset[2]))
+    found = place_by_points(model(), flat, 0, sigma_m=2.0)
+    assert "all heights on the list are 0" in "\n".join(doubts(found, {"0.jpg": np.zeros(3)}, []))
+    found = place_by_points(model(), ground, 0)
+    assert not doubts(found, {"0.jpg": np.zeros(3)}, [])
+
+
 def test_too_few_points_and_points_on_a_line(tmp_path):
     ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", SIZES)
     with pytest.raises(BadInput, match="9 of its 9 .* 3 .* 7 --checkpoints"):
