@@ -93,8 +93,12 @@ def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[
 
 def said_of(wrong: Sequence[WrongMark]) -> str:
     """Which points have marks that contradict the others, as the end of a message; nothing where none has."""
+    away = [mark.pixels for mark in wrong if mark.pixels is not None]
+    if not wrong:
+        return ""
     names = list(dict.fromkeys(mark.point for mark in wrong))
-    return f". Marks that contradict each other are left out of {few(names)}" if names else ""
+    less = f"; if they are no more accurate, add --mark-sigma {np.median(away):.0f}" if away else ""
+    return f". Marks that contradict each other are left out of {few(names)}{less}"
 
 
 def adjust_to_points_once(

@@ -10,9 +10,10 @@ import pytest
 from flight import FOCAL, HEIGHT, NOISE_PX, WIDTH, fly, reconstructed
 
 from surfkit.apps.sfm.bundle_adjustment import adjust
-from surfkit.apps.sfm.control_adjustment import adjust_to_points, adjust_to_points_once, clean_marks
+from surfkit.apps.sfm.control_adjustment import adjust_to_points, adjust_to_points_once, clean_marks, said_of
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint, read_ground, read_list
 from surfkit.apps.sfm.control_marks import (
+    WrongMark,
     images_of,
     mark_residuals,
     projected,
@@ -249,6 +250,12 @@ def control(wrong):
     return ControlResiduals(
         CHART, Similarity(1.0, np.eye(3), np.zeros(3)), {}, (), (), (), (), True, wrong_marks=tuple(wrong)
     )
+
+
+def test_a_refusal_says_which_points_have_wrong_marks():
+    wrong = [WrongMark("G1", "a", 4.0, True), WrongMark("G2", "a", 8.0, False), WrongMark("G2", "b", None, False)]
+    assert said_of([]) == "" and said_of(wrong).endswith("'G1', 'G2'; if they are no more accurate, add --mark-sigma 6")
+    assert said_of(wrong[2:]).endswith("are left out of 'G2'")
 
 
 def test_positions_of_photographs_keep_their_common_error(flown, tmp_path):
