@@ -11,6 +11,8 @@ import pytest
 from PIL import Image
 
 from surfkit.appearance.exposure import Exposure
+from surfkit.apps.doctor import examine as examine_module
+from surfkit.apps.doctor import geometry
 from surfkit.apps.doctor.examine import examine
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import dump
@@ -498,3 +500,15 @@ def test_light_that_differs_is_told_with_figures(tmp_path):
     darkest = re.search("'view_(\\d+).png' is the darkest", light.text)
     assert int(darkest[1]) % 2 == 0, "every other one, from the first on"
     assert "exposure" not in told(folder, quick=True)
+
+
+def test_light_of_many_photographs_is_compared_where_some_of_them_are(tmp_path, monkeypatch):
+    """Points drawn from the whole scene are too few in each photograph to tell."""
+    folder = tmp_path / "tracked"
+    write_colmap(folder, photograph(FLIGHT), tracks=True)
+    brightened(folder)
+    monkeypatch.setattr(examine_module, "sampled", lambda shots: shots[4:10])
+    monkeypatch.setattr(geometry, "COMPARED_POINTS", 40)
+    (light,) = told(folder)["exposure"]
+    named = re.findall(r"'view_(\d+).png'", light.text)
+    assert all(4 <= int(at) < 10 for at in named) and " the brightest of 6 that were compared" in light.text
