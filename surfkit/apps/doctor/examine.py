@@ -147,13 +147,17 @@ def _look(
 
 def _photographs(data: Data, gathered: Gathered, looks: dict[Path, Photograph]) -> list[Finding]:
     """Damaged, blank and unused photographs."""
-    names = {shot.path: shot.name for shot in gathered.capture.shots}
-    faults = {names.get(path, path.name): bare(path, look.fault) for path, look in looks.items() if look.fault}
-    cure = "copy it again, or delete it from the model"
+    folder = data.path / (data.images or "images")
+    folder = folder if folder.is_dir() else data.path
+    names = {path: os.path.relpath(path, folder) for path in gathered.loose}  # drones number each folder from 1
+    names |= {shot.path: shot.name for shot in gathered.capture.shots}
+    faults = {names[path]: bare(path, look.fault) for path, look in looks.items() if look.fault}
+    away = "delete them from the model" if gathered.capture.shots else "leave them out"
+    cure = f"copy them again, or {away}"
     found = of_each("damaged-photographs", faults, cure)
-    flat = [names.get(path, path.name) for path, look in looks.items() if look.flat]
+    flat = [names[path] for path, look in looks.items() if look.flat]
     if flat:
-        text = f"{len(flat)} photographs are of one colour throughout, {few(flat)}: delete them from the model"
+        text = f"{len(flat)} photographs are of one colour throughout, {few(flat)}: {away}"
         found.append(Finding("warning", "blank-photographs", text, tuple(flat)))
     loose, used = gathered.loose, len(gathered.capture.shots)
     if loose and used:
@@ -163,7 +167,7 @@ def _photographs(data: Data, gathered: Gathered, looks: dict[Path, Photograph]) 
             f"used, {few(others)}; align them too, if they belong to the scene"
         )
         found.append(Finding("warning" if len(loose) > used / 4 else "note", "unused-pictures", text, others))
-    turned = [names.get(path, path.name) for path, look in looks.items() if look.turned]
+    turned = [names[path] for path, look in looks.items() if look.turned]
     if turned:
         text = (
             f"EXIF of {len(turned)} photographs asks for a turn, {few(turned)}, which is not made: they are used as "

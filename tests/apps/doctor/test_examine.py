@@ -479,6 +479,21 @@ def test_every_shot_of_an_odm_project_is_looked_at(farm):
     assert found["damaged-photographs"][0].names == ("view_002.png",)
 
 
+def test_photographs_without_a_model_are_counted_and_named_with_their_folders(farm):
+    """As drones write them: numbered from 1 in each folder, beside other files."""
+    shutil.rmtree(farm / "sparse")
+    for folder, at in (("100MEDIA", 3), ("101MEDIA", 4)):
+        (farm / folder).mkdir()
+        shutil.copy(farm / f"images/view_00{at}.png", farm / folder / "DJI_0001.png")
+    shutil.rmtree(farm / "images")
+    (farm / "101MEDIA/DJI_0002.JPG").write_bytes(b"")
+    (farm / "101MEDIA/._DJI_0001.JPG").write_bytes(b"of macOS")
+    found = examine(Data(farm), recipes()["2dgs"]).diagnosis
+    assert found.found["photographs"].startswith("3, none with a pose")
+    (damaged,) = [one for one in found.findings if one.what == "damaged-photographs"]
+    assert damaged.names == ("101MEDIA/DJI_0002.JPG",) and damaged.text.endswith("again, or leave them out")
+
+
 def test_masks_beside_photographs_are_no_unused_pictures(farm):
     moved = Path(shutil.move(farm, farm.parent / "masks"))
     for name in ("view_003_mask.png", "view_004.mask.png"):

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surfkit.apps.doctor.coverage_gaps import holes
 from surfkit.apps.doctor import geometry
+from surfkit.apps.doctor.coverage_gaps import holes
 from surfkit.apps.doctor.geometry import places, points_in_common, survey
 from surfkit.io.datasets.raw_dataset import RawImage, load_pycolmap
 
