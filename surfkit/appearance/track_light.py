@@ -30,6 +30,7 @@ from surfkit.appearance.response import (
     sensor_scale,
 )
 from surfkit.core.check import BadInput
+from surfkit.scene.normal_equations import solved
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import read_draft
 from surfkit.scene.scene import View
@@ -39,8 +40,8 @@ DRAFT_SIDE_PX = 256
 """Longer side at which photographs are read, pixels, or up to twice that: the colour of a place is a mean around it."""
 DARK, BRIGHT = 0.03, 0.97
 """Colours beyond say little: noise there, and white that is cut off."""
-MAX_POINTS_PER_PHOTO = 300
-"""On average; others are left out, chosen at random."""
+MAX_POINTS_PER_PHOTO, MAX_SIGHTS = 300, 3_000_000
+"""On average, and of all photographs, of which a million take a GB; other points are left out, chosen at random."""
 ROUNDS = 20
 """Of the robust fit; each solves a linear problem."""
 SHARES = (1.0, 0.5, 0.25, 0.125)
@@ -102,7 +103,7 @@ def track_colors(views: Sequence[View], tracks: Observations) -> TrackColors:
     shown = [tracks.seen.get(view.name) for view in views]
     counts = sum((np.bincount(one.points, minlength=len(tracks.xyz)) for one in shown if one is not None), start=0)
     kept = np.flatnonzero(np.asarray(counts) > 1)
-    total, most = int(np.asarray(counts)[kept].sum()), MAX_POINTS_PER_PHOTO * len(views)
+    total, most = int(np.asarray(counts)[kept].sum()), min(MAX_POINTS_PER_PHOTO * len(views), MAX_SIGHTS)
     if total > most:
         kept = np.sort(np.random.default_rng(0).permutation(kept)[: len(kept) * most // total])
     rows = np.full(len(tracks.xyz), -1)
@@ -358,7 +359,7 @@ class _Problem:
             ]
         ).tocsr()
         held = sparse.diags(self.spread(numbers) ** -2.0) + alike.T @ alike / SAME_CURVE**2
-        return np.asarray(sparse.linalg.spsolve((normal + held).tocsc(), pull - held @ numbers.flat))
+        return solved(normal + held, pull - held @ numbers.flat, numbers.cameras.size)
 
 
 def _before_curve(color: np.ndarray, curve: np.ndarray) -> np.ndarray:
