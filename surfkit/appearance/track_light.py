@@ -34,7 +34,7 @@ from surfkit.scene.normal_equations import solved
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import read_draft
 from surfkit.scene.scene import View
-from surfkit.scene.srgb import linear
+from surfkit.scene.srgb import from_linear, linear
 
 DRAFT_SIDE_PX = 256
 """Longer side at which photographs are read, pixels, or up to twice that: the colour of a place is a mean around it."""
@@ -256,8 +256,9 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """What numbers leave: (K, 3) colours before the response curve; log2 of the light of points as each sight has it;
-    d colour / d stops; and the difference of that light to the mean of its point, as a difference of colours."""
+    """What numbers leave: (K, 3) colours before the response curve, as the numbers have them; log2 of the light of
+    points as each sight has it; d colour / d stops; and the difference of that light to the mean of its point, as a
+    difference of colours."""
 
     encoded: np.ndarray
     light: np.ndarray
@@ -293,15 +294,17 @@ class _Problem:
 
     def residuals(self, numbers: _Numbers, deviation: float) -> _Residuals:
         curve = numbers.cameras[self.camera][:, CURVE].T[..., None]
+        shift = numbers.stops[self.photo] - falloff(numbers.cameras[self.camera].T, self.squared(numbers)[1])[:, None]
         encoded = _before_curve(self.color, curve)
-        slope = math.log(2) * np.where(encoded <= KNEE, encoded, (encoded + 0.055) / 2.4) * curve_slope(encoded, curve)
-        light = np.log2(linear(encoded).clip(1e-6)) - numbers.stops[self.photo]
-        light += falloff(numbers.cameras[self.camera].T, self.squared(numbers)[1])[:, None]
-        left = (light - self.medians(light)) * slope
+        light, slope = np.log2(linear(encoded).clip(1e-6)) - shift, _stops_slope(encoded, curve)
+        mean = self.medians(light)
         for _ in range(MEANS):
-            weight = slope**2 / (1 + (left / (ROBUST * deviation)) ** 2)
-            left = (light - self.means(light, weight)) * slope
-        return _Residuals(encoded, light, slope, left)
+            left = (light - mean) * slope
+            mean = self.means(light, slope**2 / (1 + (left / (ROBUST * deviation)) ** 2))
+        # Where the point and the photograph have it: by its own colour, the noise of a sight would pass for a curve.
+        encoded = from_linear((2 ** (mean + shift)).clip(0, 1))
+        slope = _stops_slope(encoded, curve)
+        return _Residuals(encoded, light, slope, (light - mean) * slope)
 
     def medians(self, value: np.ndarray) -> np.ndarray:
         """(K, 3) of (K, 3) values, the median of all sights of the same point."""
@@ -360,6 +363,12 @@ class _Problem:
         ).tocsr()
         held = sparse.diags(self.spread(numbers) ** -2.0) + alike.T @ alike / SAME_CURVE**2
         return solved(normal + held, pull - held @ numbers.flat, numbers.cameras.size)
+
+
+def _stops_slope(encoded: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """(K, 3) d colour / d stops at colours before response curves, (3, K, 1)."""
+    steep = np.where(encoded <= KNEE, encoded, (encoded + 0.055) / 2.4)
+    return math.log(2) * steep * curve_slope(encoded, curve)
 
 
 def _before_curve(color: np.ndarray, curve: np.ndarray) -> np.ndarray:
