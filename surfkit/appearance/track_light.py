@@ -30,17 +30,18 @@ from surfkit.appearance.response import (
     sensor_scale,
 )
 from surfkit.core.check import BadInput
+from surfkit.scene.normal_equations import solved
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import read_draft
 from surfkit.scene.scene import View
-from surfkit.scene.srgb import linear
+from surfkit.scene.srgb import from_linear, linear
 
 DRAFT_SIDE_PX = 256
 """Longer side at which photographs are read, pixels, or up to twice that: the colour of a place is a mean around it."""
 DARK, BRIGHT = 0.03, 0.97
 """Colours beyond say little: noise there, and white that is cut off."""
-MAX_POINTS_PER_PHOTO = 300
-"""On average; others are left out, chosen at random."""
+MAX_POINTS_PER_PHOTO, MAX_SIGHTS = 300, 3_000_000
+"""On average, and of all photographs, of which a million take a GB; other points are left out, chosen at random."""
 ROUNDS = 20
 """Of the robust fit; each solves a linear problem."""
 SHARES = (1.0, 0.5, 0.25, 0.125)
@@ -102,7 +103,7 @@ def track_colors(views: Sequence[View], tracks: Observations) -> TrackColors:
     shown = [tracks.seen.get(view.name) for view in views]
     counts = sum((np.bincount(one.points, minlength=len(tracks.xyz)) for one in shown if one is not None), start=0)
     kept = np.flatnonzero(np.asarray(counts) > 1)
-    total, most = int(np.asarray(counts)[kept].sum()), MAX_POINTS_PER_PHOTO * len(views)
+    total, most = int(np.asarray(counts)[kept].sum()), min(MAX_POINTS_PER_PHOTO * len(views), MAX_SIGHTS)
     if total > most:
         kept = np.sort(np.random.default_rng(0).permutation(kept)[: len(kept) * most // total])
     rows = np.full(len(tracks.xyz), -1)
@@ -255,8 +256,9 @@ class _Numbers:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """What numbers leave: (K, 3) colours before the response curve; log2 of the light of points as each sight has it;
-    d colour / d stops; and the difference of that light to the mean of its point, as a difference of colours."""
+    """What numbers leave: (K, 3) colours before the response curve, as the numbers have them; log2 of the light of
+    points as each sight has it; d colour / d stops; and the difference of that light to the mean of its point, as a
+    difference of colours."""
 
     encoded: np.ndarray
     light: np.ndarray
@@ -292,15 +294,17 @@ class _Problem:
 
     def residuals(self, numbers: _Numbers, deviation: float) -> _Residuals:
         curve = numbers.cameras[self.camera][:, CURVE].T[..., None]
+        shift = numbers.stops[self.photo] - falloff(numbers.cameras[self.camera].T, self.squared(numbers)[1])[:, None]
         encoded = _before_curve(self.color, curve)
-        slope = math.log(2) * np.where(encoded <= KNEE, encoded, (encoded + 0.055) / 2.4) * curve_slope(encoded, curve)
-        light = np.log2(linear(encoded).clip(1e-6)) - numbers.stops[self.photo]
-        light += falloff(numbers.cameras[self.camera].T, self.squared(numbers)[1])[:, None]
-        left = (light - self.medians(light)) * slope
+        light, slope = np.log2(linear(encoded).clip(1e-6)) - shift, _stops_slope(encoded, curve)
+        mean = self.medians(light)
         for _ in range(MEANS):
-            weight = slope**2 / (1 + (left / (ROBUST * deviation)) ** 2)
-            left = (light - self.means(light, weight)) * slope
-        return _Residuals(encoded, light, slope, left)
+            left = (light - mean) * slope
+            mean = self.means(light, slope**2 / (1 + (left / (ROBUST * deviation)) ** 2))
+        # Where the point and the photograph have it: by its own colour, the noise of a sight would pass for a curve.
+        encoded = from_linear((2 ** (mean + shift)).clip(0, 1))
+        slope = _stops_slope(encoded, curve)
+        return _Residuals(encoded, light, slope, (light - mean) * slope)
 
     def medians(self, value: np.ndarray) -> np.ndarray:
         """(K, 3) of (K, 3) values, the median of all sights of the same point."""
@@ -358,7 +362,13 @@ class _Problem:
             ]
         ).tocsr()
         held = sparse.diags(self.spread(numbers) ** -2.0) + alike.T @ alike / SAME_CURVE**2
-        return np.asarray(sparse.linalg.spsolve((normal + held).tocsc(), pull - held @ numbers.flat))
+        return solved(normal + held, pull - held @ numbers.flat, numbers.cameras.size)
+
+
+def _stops_slope(encoded: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """(K, 3) d colour / d stops at colours before response curves, (3, K, 1)."""
+    steep = np.where(encoded <= KNEE, encoded, (encoded + 0.055) / 2.4)
+    return math.log(2) * steep * curve_slope(encoded, curve)
 
 
 def _before_curve(color: np.ndarray, curve: np.ndarray) -> np.ndarray:

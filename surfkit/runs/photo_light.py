@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,12 +17,15 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.registry import name_of
 from surfkit.io.datasets.panoramas import points_remedy
+from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.io.datasets.read import observations
 from surfkit.raster.api import Maps
 from surfkit.runs.folder import Run, RunStage
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
+Shot = TypeVar("Shot", View, RawImage)
+"""A photograph."""
 GROUPS, GROUP = 5, 20
 """Of photographs, and how many each has, that are looked at for a warning."""
 
@@ -101,13 +104,12 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
     if tracks.is_empty:
         say("light of the photographs: not known, as nothing tells which show which points; colours stay as they are")
         return LightRecord({}, {}, 0.0, None, is_used=False)
-    views = scene.train if is_wanted else sampled(scene.train)
-    light = light_by_tracks(views, tracks)
-    if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
-        say(f"light of the photographs: {spread}; that is little, so colours stay as they are")
-        return LightRecord({}, {}, 0.0, spread, is_used=False)
-    if len(views) < len(scene.train):
-        light = light_by_tracks(scene.train, tracks)
+    some = scene.train if is_wanted else sampled(scene.train)
+    for views in [scene.train] if len(some) == len(scene.train) else [some, scene.train]:  # a few may only seem uneven
+        light = light_by_tracks(views, tracks)
+        if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
+            say(f"light of the photographs: {spread}; that is little, so colours stay as they are")
+            return LightRecord({}, {}, 0.0, spread, is_used=False)
     say(f"light of the photographs: {LightSpread.of(light)}; colours are compared in the light of each")
     if unknown := [view.name for view, seen in zip(scene.train, light.seen, strict=True) if seen < MIN_SEEN]:
         emit(
@@ -128,8 +130,8 @@ def warn_of_light(run: Run, scene: Scene) -> None:
         emit(Warned(spread.remedy(True, settings)))
 
 
-def sampled(views: Sequence[View]) -> Sequence[View]:
-    """Views that tell how far light differs: of many, groups that follow one another in the order of their names."""
+def sampled(views: Sequence[Shot]) -> Sequence[Shot]:
+    """Photographs that tell how far light differs: of many, groups that follow one another in the order of names."""
     if len(views) <= GROUPS * GROUP:
         return views
     starts = np.linspace(0, len(views) - GROUP, GROUPS).astype(int)

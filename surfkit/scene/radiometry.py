@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
 
 from surfkit.scene.camera import Camera
+from surfkit.scene.normal_equations import solved
 from surfkit.scene.srgb import from_linear, linear
 
 MIN_SHARED_PLACES = 30
@@ -148,7 +148,7 @@ def estimate(shared: SharedPlaces, cameras: np.ndarray) -> Radiometry:
         large = (found[:views] ** 2).mean(1) / PRIOR_SIGMA**2
         held = PRIOR_PLACES + PRIOR_SHARE * np.bincount(photo, weight, views) / (1 + large)
         held = diags(np.concatenate([held, np.full(count, PRIOR_VIGNETTING)]))
-        found = spsolve((matrix + held).tocsc(), side).reshape(-1, 3)
+        found = solved(matrix + held, side, count).reshape(-1, 3)
         shown = light + design @ found
         mean = (of_place @ (weight[:, None] * shown)) / total[:, None]
         away = np.sqrt(((shown - mean[place]) ** 2).mean(1))

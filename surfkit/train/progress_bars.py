@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Live
 
 from surfkit.core.check import printable
+from surfkit.core.clock import clock
 from surfkit.core.events import Progress
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
@@ -26,6 +27,7 @@ class ProgressBars:
         self.live: Live | None = None
         self.tasks: dict[str, TaskID] = {}
         self.told = 0.0
+        self.begun: dict[str, tuple[int, float]] = {}
 
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
@@ -34,11 +36,24 @@ class ProgressBars:
             return
         if self.console.is_terminal:
             self.draw(event)
-        elif event.done == event.total or time.perf_counter() - self.told > BAR_LINE_EVERY_S:
-            self.told = time.perf_counter()
-            self.console.print(
-                printable(f"{event.what}  {event.done}/{event.total}"), highlight=False, soft_wrap=True, markup=False
-            )
+            return
+        now, left = time.perf_counter(), self.left(event)
+        if event.done == event.total or now - self.told > BAR_LINE_EVERY_S:
+            self.told = now
+            text = printable(f"{event.what}  {event.done}/{event.total}{left}")
+            self.console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+    def left(self, event: Progress) -> str:
+        """The time that the event's work will still take, in words, at the pace since it was first told of; nothing at
+        its beginning and its end."""
+        now = time.perf_counter()
+        first, begun = self.begun.setdefault(event.what, (event.done, now))
+        if event.done >= event.total:
+            del self.begun[event.what]
+            return ""
+        if event.done <= first:
+            return ""
+        return f"  {clock((now - begun) * (event.total - event.done) / (event.done - first))} left"
 
     def draw(self, event: Progress) -> None:
         """Move the bar of the event's work; the last one to end takes the display with it."""

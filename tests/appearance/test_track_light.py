@@ -90,6 +90,23 @@ def test_curves_of_two_cameras_are_told_apart():
     assert "response curves of 2 cameras by" in str(spread)
 
 
+def test_noise_passes_for_no_response_curve_where_cameras_share_little():
+    """As those of a drone in the morning and of another one in the afternoon, each over its part of the ground."""
+    side, draw = 12, np.random.default_rng(0)
+    spots = draw.uniform(0, side, (3_000, 2))
+    steps = np.stack(np.meshgrid(range(-2, 2), range(-2, 2)), -1).reshape(-1, 2)
+    near = (spots.astype(int)[:, None] + steps).reshape(-1, 2)
+    point, inside = np.repeat(np.arange(len(spots)), len(steps)), ((near >= 0) & (near < side)).all(1)
+    point, photo = point[inside], near[inside] @ (side, 1)
+    stops = draw.normal(0, 0.3, (side * side, 3))
+    light = linear(draw.uniform(0.2, 0.6, (len(spots), 3)))[point] * 2 ** stops[photo]
+    color = from_linear(light.clip(0, 1)) + draw.normal(0, 0.02, light.shape)
+    place = (spots[point] - np.stack([photo // side, photo % side], 1)) / 4
+    light = fit_light(TrackColors(photo, point, place, color.clip(0, 1)), np.arange(side * side) * 3 // side**2)
+    error = light.stops - stops
+    assert (error - error.mean(0)).std() < 0.05 and LightSpread.of(light).curve < 0.015
+
+
 def test_photographs_that_share_too_little_are_known_by_their_count():
     colors, stops, taken_by = world()
     few = np.flatnonzero(colors.photo == 4)[MIN_SEEN - 4 :]

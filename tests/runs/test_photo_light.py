@@ -184,6 +184,23 @@ def test_even_light_changes_nothing_where_only_uneven_light_is_looked_for(data, 
     assert load_run(tmp_path / "uneven")[1].appearances["value"].abs().max() > 0.4
 
 
+def test_light_that_is_uneven_in_some_photographs_alone_changes_nothing(data, recipe, tmp_path, monkeypatch, capsys):
+    """All are looked at before colours are changed in all: a few tell response curves badly."""
+    monkeypatch.setattr(photo_light, "sampled", lambda views: views[:5])
+    looked = []
+
+    def fit(views, tracks):
+        looked.append(len(views))
+        stops = np.linspace(-1, 1, len(views))[:, None] * (1.0 if len(views) == 5 else 0.1) * np.ones(3)
+        return TrackLight(stops, np.zeros((1, 8)), np.full(len(views), 99), 0.01)
+
+    monkeypatch.setattr(photo_light, "light_by_tracks", fit)
+    looks = replace(recipe, pretrain=replace(recipe.pretrain, appearance=CameraResponse("uneven")))
+    found = photo_light.needed_light(Run(tmp_path, looks, data), read(data))
+    assert looked == [5, 16] and not found.is_used and found.spread.stops == pytest.approx(0.16)
+    assert "differ by 0.2 stops" in capsys.readouterr().err
+
+
 def test_without_tracks_light_that_is_only_looked_for_is_not_known(recipe, tmp_path, capsys):
     write_colmap(tmp_path / "data", photograph(Flight(views=6, width=32, height=24, points=60)))
     stage = replace(recipe.pretrain, steps=2, appearance=CameraResponse("uneven"))

@@ -173,6 +173,7 @@ def rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     table = [
         ("points at the end", likely_range(found)),
         ("time", f"{duration(found.seconds)} ({steps} ms a step, from the beginning to the end)"),
+        *_depth_rows(found),
         (
             "memory",
             f"{size(found.memory_bytes)}, of which photographs {size(found.cache_bytes)}; "
@@ -186,6 +187,12 @@ def rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     if not found.points_known:
         table.append(("", "how much the number of points grows is a rule of thumb; --points tries another number"))
     return table
+
+
+def _depth_rows(found: ResourceEstimate) -> list[tuple[str, str]]:
+    """Of depth maps, if some are made."""
+    text = f"{duration(found.depth_seconds)} before, for depth maps, unless an earlier run has made them"
+    return [("", text)] if found.depth_seconds else []
 
 
 def _gpu_rows(found: ResourceEstimate) -> list[tuple[str, str]]:

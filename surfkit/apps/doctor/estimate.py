@@ -113,6 +113,7 @@ class ResourceEstimate:
         room: What the machine has.
         probe_seconds: That the probe took.
         movable_bytes: Points with their moments and statistics that can be kept elsewhere than where they are drawn.
+        depth_seconds: Of the depth maps before, not among `seconds`; 0 where none are made, or a few do not tell.
     """
 
     points: int
@@ -128,6 +129,7 @@ class ResourceEstimate:
     probe_seconds: float = 0.0
     gpu: GpuEstimate | None = None
     movable_bytes: int = 0
+    depth_seconds: float = 0.0
 
 
 def estimate(
@@ -207,9 +209,9 @@ def advice(found: ResourceEstimate) -> list[Finding]:
 
 def first_look(found: ResourceEstimate) -> list[Finding]:
     """The recipe for a first look, where one that begins at stereo depth takes hours."""
-    if found.seconds <= FIRST_LOOK_S:
+    if (seconds := found.seconds + found.depth_seconds) <= FIRST_LOOK_S:
         return []
-    text = f"the run will take about {duration(found.seconds)}; recipe:surface-short --steps 500 is a first look"
+    text = f"the run will take about {duration(seconds)}; recipe:surface-short --steps 500 is a first look"
     return [Finding("note", "first-look", text)]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from surfkit.apps.doctor.estimate import ResourceEstimate
 from surfkit.apps.doctor.examine_photos import Photograph, PhotoToExamine, look_at
 from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding, of_each
 from surfkit.apps.doctor.gather import Gathered, gather
-from surfkit.apps.doctor.geometry import Geometry, seen_by, survey
+from surfkit.apps.doctor.geometry import Geometry, points_in_common, seen_by, survey
 from surfkit.apps.doctor.light import uneven_light
 from surfkit.apps.doctor.priors import priors
 from surfkit.core.check import BadInput, few
@@ -30,6 +30,7 @@ from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.io.datasets.read import check_size
 from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.io.datasets.undistort import cache_folder, is_panorama, is_pinhole
+from surfkit.runs.photo_light import sampled
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.connected_photos import groups_warning, untied_warning
 from surfkit.scene.decoded_photos import place
@@ -37,8 +38,6 @@ from surfkit.scene.photos import refuse_large
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
-COLORED_POINTS = 1_000
-"""Sparse points at which the colours of photographs are compared."""
 MAX_INVERTED_SHARE = 0.2
 """A mask that keeps less is probably inverted, if most masks are so."""
 
@@ -99,7 +98,10 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
     gathered = gather(data, quick)
     seconds, peak = time.perf_counter() - start, peak_memory_bytes()
     geometry = survey(gathered.capture.shots, gathered.train, gathered.capture.xyz, recipe.pretrain.near)
-    looks = _look(gathered, geometry, quick, told)
+    sound = [shot for shot in gathered.train if shot.name in geometry.sound]
+    lit = () if quick else sampled(sound)
+    compared = points_in_common(lit, gathered.capture.xyz)
+    looks = _look(gathered, {shot.name for shot in lit}, compared, quick, told)
     known = {shot.name: looks[shot.path] for shot in gathered.capture.shots if shot.path in looks}
     findings = [
         *gathered.findings,
@@ -110,7 +112,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_split(data, gathered),
         *_groups(gathered),
         *_untied(gathered),
-        *uneven_light(gathered, known, geometry.sample[:COLORED_POINTS], recipe),
+        *uneven_light(gathered, known, compared, recipe),
         *priors(data, gathered, recipe, quick),
     ]
     findings.sort(key=lambda finding: FINDING_LEVELS.index(finding.level))
@@ -119,14 +121,16 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
     return ExaminedData(diagnosis, gathered, known, seconds, peak)
 
 
-def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None) -> dict[Path, Photograph]:
-    """A look at every photograph that is there; at those without a pose only where nothing has one."""
-    compared = geometry.sample[:COLORED_POINTS]
+def _look(
+    gathered: Gathered, lit: Set[str], compared: np.ndarray, quick: bool, told: Told | None
+) -> dict[Path, Photograph]:
+    """A look at every photograph that is there, at those called as in `lit` with their colours at the points that are
+    compared; at those without a pose only where nothing has one."""
     wanted = [
         PhotoToExamine(
             shot.path,
             gathered.masks.get(shot.name),
-            seen_by(shot, compared) if len(compared) and shot.name in geometry.sound else None,
+            seen_by(shot, compared) if len(compared) and shot.name in lit else None,
             gathered.pixels[shot.name],
         )
         for shot in gathered.capture.shots
@@ -143,13 +147,17 @@ def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None
 
 def _photographs(data: Data, gathered: Gathered, looks: dict[Path, Photograph]) -> list[Finding]:
     """Damaged, blank and unused photographs."""
-    names = {shot.path: shot.name for shot in gathered.capture.shots}
-    faults = {names.get(path, path.name): bare(path, look.fault) for path, look in looks.items() if look.fault}
-    cure = "copy it again, or delete it from the model"
+    folder = data.path / (data.images or "images")
+    folder = folder if folder.is_dir() else data.path
+    names = {path: os.path.relpath(path, folder) for path in gathered.loose}  # drones number each folder from 1
+    names |= {shot.path: shot.name for shot in gathered.capture.shots}
+    faults = {names[path]: bare(path, look.fault) for path, look in looks.items() if look.fault}
+    away = "delete them from the model" if gathered.capture.shots else "leave them out"
+    cure = f"copy them again, or {away}"
     found = of_each("damaged-photographs", faults, cure)
-    flat = [names.get(path, path.name) for path, look in looks.items() if look.flat]
+    flat = [names[path] for path, look in looks.items() if look.flat]
     if flat:
-        text = f"{len(flat)} photographs are of one colour throughout, {few(flat)}: delete them from the model"
+        text = f"{len(flat)} photographs are of one colour throughout, {few(flat)}: {away}"
         found.append(Finding("warning", "blank-photographs", text, tuple(flat)))
     loose, used = gathered.loose, len(gathered.capture.shots)
     if loose and used:
@@ -159,7 +167,7 @@ def _photographs(data: Data, gathered: Gathered, looks: dict[Path, Photograph]) 
             f"used, {few(others)}; align them too, if they belong to the scene"
         )
         found.append(Finding("warning" if len(loose) > used / 4 else "note", "unused-pictures", text, others))
-    turned = [names.get(path, path.name) for path, look in looks.items() if look.turned]
+    turned = [names[path] for path, look in looks.items() if look.turned]
     if turned:
         text = (
             f"EXIF of {len(turned)} photographs asks for a turn, {few(turned)}, which is not made: they are used as "

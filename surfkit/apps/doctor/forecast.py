@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from surfkit.apps.doctor.depth_time import depth_seconds
 from surfkit.apps.doctor.estimate import FixedCosts, MachineLimits, ResourceEstimate, advice, estimate, first_look
 from surfkit.apps.doctor.examine import ExaminedData, Told
 from surfkit.apps.doctor.finding import Finding, from_errors
@@ -82,7 +83,8 @@ def forecast(
             scene, load = _scene(data, examined, load, Path(folder))
         except BadInput as error:
             return None, from_errors("probe", [error])
-        pixels = sum(w * h for w, h in read_sizes(data, examined, {s.name for s in examined.gathered.train}))
+        sizes = read_sizes(data, examined, {s.name for s in examined.gathered.train})
+        pixels = sum(w * h for w, h in sizes)
         first = recipe.start.expected(len(scene.cloud.xyz), pixels)
         rising = growth(recipe.pretrain, first, pixels, plan.points, recipe.start.is_dense)
         parts = schedule(recipe.pretrain.steps, rising)
@@ -91,19 +93,22 @@ def forecast(
         priors = wanted and bool(_with_maps(data, examined, recipe))
         job = ProbeJob(recipe, scene, held_back, plan.steps, MAX_PROBE_S, priors, plan.device)
         probed = probe(job, None if told is None else lambda done, all_: told("probe", done, all_))
+        before = 0.0
+        if probed.failure is None and probed.written is not None:
+            before = depth_seconds(data, examined, recipe, sizes, plan.device, Path(folder))
     if probed.failure is not None or probed.written is None:
         return None, [_failed(probed, held_back)]
     found = estimate(load, parts, rising, probed, room)
-    found = replace(found, probe_seconds=time.perf_counter() - begun)
+    found = replace(found, probe_seconds=time.perf_counter() - begun, depth_seconds=before)
     look = first_look(found) if recipe.start.is_dense and recipe.start.needs_prior else []
-    return found, [*beyond(recipe), *advice(found), *look]
+    return found, [*beyond(recipe, before > 0), *advice(found), *look]
 
 
-def beyond(recipe: Recipe) -> list[Finding]:
-    """What of the run the forecast leaves out."""
+def beyond(recipe: Recipe, with_maps: bool = False) -> list[Finding]:
+    """What of the run the forecast leaves out; `with_maps` says that the time of depth maps is in it."""
     later = ["the blocks, which are foretold when they are planned"] if recipe.partition is not None else []
     later += ["what the recipe refines"] if recipe.refine else []
-    later += ["making depth maps, where the data set has none"] if recipe.depth is not None else []
+    later += ["making depth maps, where the data set has none"] if recipe.depth is not None and not with_maps else []
     later += ["making the mesh"] if recipe.mesh is not None else []
     text = f"memory, disk and time are those of pretraining alone; the run needs more for: {'; '.join(later)}"
     return [Finding("note", "forecast", text)] if later else []

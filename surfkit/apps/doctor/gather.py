@@ -22,7 +22,7 @@ from surfkit.io.datasets.masks import MASK_MARKS, MASKS_FOLDER, find_masks, with
 from surfkit.io.datasets.panoramas import view_names
 from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
-from surfkit.io.datasets.read import model_folder, read_capture, reader_of
+from surfkit.io.datasets.read import bare_photographs, model_folder, read_capture, reader_of
 from surfkit.scene.photo_names import PICTURE_SUFFIXES
 from surfkit.scene.pixels import DEFAULT_PIXELS, Pixels
 from surfkit.scene.scene import Mask
@@ -135,17 +135,23 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, RawDataset]:
 
 
 def _loose(data: Data, shots: Sequence[RawImage]) -> tuple[Path, ...]:
-    """Pictures in the folders of the photographs that no shot is of; those in images/ where there are no shots."""
+    """Pictures in the folders of the photographs that no shot is of; where there are no shots, all in images/, or in
+    the folder itself where surfkit finds their cameras."""
     if not data.path.is_dir():
         return ()
     used = {shot.path for shot in shots}
     named = data.path / (data.images or "images")
+    if not shots and data.images is None:
+        named = bare_photographs(data.path) or named
     folders = [named] if named.is_dir() else sorted({path.parent for path in used})
     found = (path for folder in folders for path in sorted(folder.rglob("*") if folder == named else folder.glob("*")))
     return tuple(
         path
         for path in found
-        if path.suffix.lower() in PICTURE_SUFFIXES and path not in used and not _is_mask(path, data.path)
+        if path.suffix.lower() in PICTURE_SUFFIXES
+        and path not in used
+        and not path.name.startswith(".")  # what macOS keeps beside a photograph
+        and not _is_mask(path, data.path)
     )
 
 

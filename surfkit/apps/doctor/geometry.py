@@ -17,11 +17,15 @@ from surfkit.scene.scene import Frame
 
 SAMPLED_POINTS = 4_000
 """Sparse points, evenly drawn, that stand for all of them."""
+COMPARED_POINTS, CANDIDATE_POINTS = 1_000, 200_000
+"""Sparse points at which the colours of photographs are compared, and out of which they are chosen."""
 MAX_RAY_OVERSHOOT = 0.3
 """Share of the image by which a ray may miss it before its distortion: polynomials fold far rays back in."""
 FAR_CAMERA = 25.0
 """A camera so many times farther out than the median one is no part of the scene."""
 FEW_POINTS, FEW_IN_VIEW, FEW_VIEWS = 1_000, 10, 3
+BATCH_POINTS = 65_536
+"""Points between two checks whether a photograph has enough of them in view."""
 MAX_THIN_SHARE = 0.2
 """Share of the points that may be seen by fewer than FEW_VIEWS photographs; the rim of a survey is."""
 MAX_NEAR_SHARE = 0.01
@@ -75,12 +79,12 @@ def survey(shots: Sequence[RawImage], train: Sequence[RawImage], xyz: np.ndarray
     findings += [*_poses(sound), *_numbers(sound, xyz, extent)]
     if not len(xyz):
         return Geometry(extent, sample, np.zeros(0, int), None, usable, tuple(findings))
-    inside, depths = _in_view(sound, sample)
-    findings += _points(sound, xyz, inside)
+    views, counts, depths = _in_view(sound, sample)
+    findings += _points(sound, xyz, views, counts)
     findings += _nearness(depths, extent, near)
     findings += holes(xyz, np.stack([centre(shot) for shot in sound]))
     depth = float(np.median(depths)) if len(depths) else None
-    return Geometry(extent, sample, inside.sum(0), depth, usable, tuple(findings))
+    return Geometry(extent, sample, views, depth, usable, tuple(findings))
 
 
 def centre(shot: RawImage) -> np.ndarray:
@@ -122,22 +126,54 @@ def places(shot: RawImage, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found, depth
 
 
+def points_in_common(shots: Sequence[RawImage], xyz: np.ndarray) -> np.ndarray:
+    """(S, 3) float64 sparse points that two of some photographs and more have in view, if nothing hides them.
+
+    They are drawn from what these photographs show: of a large scene, that is a small part.
+
+    Args:
+        shots: Photographs, with cameras that can be used.
+        xyz: (P, 3) float64 sparse points, input frame.
+    """
+    draw = np.random.default_rng(0)
+    some = xyz[draw.permutation(len(xyz))[:CANDIDATE_POINTS]]
+    counts = np.zeros(len(some), int)
+    for shot in shots:
+        counts += np.isfinite(places(shot, some)[0]).all(1)
+    return some[np.flatnonzero(counts > 1)[:COMPARED_POINTS]]
+
+
 def seen_by(shot: RawImage, xyz: np.ndarray) -> Callable[[], np.ndarray]:
     """Gives the places of points in a photograph when they are needed."""
     return lambda: places(shot, xyz)[0]
 
 
-def _in_view(shots: Sequence[RawImage], xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(V, S) bool, which points are in view; depths of all of them, input units, or of an even part."""
+def _in_view(shots: Sequence[RawImage], xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(S,) how many photographs have each point in view; (V,) how many points each of these has; depths of all of them,
+    input units, or of an even part."""
 
     def look(shot: RawImage) -> tuple[np.ndarray, np.ndarray]:
         where, depth = places(shot, xyz)
         inside = np.isfinite(where[:, 0])
         return inside, np.sort(depth[inside])[::10]
 
+    views, counts, depths = np.zeros(len(xyz), int), [], []
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(look, shots))
-    return np.stack([inside for inside, _ in found]), np.concatenate([depth for _, depth in found])
+        for inside, some in pool.map(look, shots):
+            views += inside
+            counts.append(inside.sum())
+            depths.append(some)
+    return views, np.array(counts), np.concatenate(depths)
+
+
+def _has_few(shot: RawImage, xyz: np.ndarray) -> bool:
+    """Whether a photograph has few of all points in view; no more are looked at than tell it."""
+    count = 0
+    for start in range(0, len(xyz), BATCH_POINTS):
+        count += int(np.isfinite(places(shot, xyz[start : start + BATCH_POINTS])[0][:, 0]).sum())
+        if count >= FEW_IN_VIEW:
+            return False
+    return True
 
 
 def _camera_fault(shot: RawImage) -> str | None:
@@ -197,9 +233,9 @@ def _numbers(shots: Sequence[RawImage], xyz: np.ndarray, extent: float | None) -
     return [Finding("note", "large-coordinates", text)]
 
 
-def _points(shots: Sequence[RawImage], xyz: np.ndarray, inside: np.ndarray) -> list[Finding]:
-    """Points that no photograph shows, and photographs without points."""
-    found, views = [], inside.sum(0)
+def _points(shots: Sequence[RawImage], xyz: np.ndarray, views: np.ndarray, counts: np.ndarray) -> list[Finding]:
+    """Points that no photograph shows, and photographs without points; by those of a sample first, see `_in_view`."""
+    found = []
     unseen, thin = float((views == 0).mean()), float(((views > 0) & (views < FEW_VIEWS)).mean())
     if unseen > 0.5:
         text = (
@@ -218,9 +254,14 @@ def _points(shots: Sequence[RawImage], xyz: np.ndarray, inside: np.ndarray) -> l
             f"only {len(xyz)} sparse points to start from; a model has thousands: match more features, or triangulate"
         )
         found.append(Finding("warning", "few-points", text))
-    counts = inside.sum(1) * len(xyz) / inside.shape[1]
-    bare = [shot.name for shot, count in zip(shots, counts, strict=True) if count < FEW_IN_VIEW]
-    if bare and unseen < 1:
+    doubtful = [shot for shot, count in zip(shots, counts, strict=True) if count * len(xyz) < FEW_IN_VIEW * len(views)]
+    bare = []
+    if doubtful and unseen < 1:  # of thousands of photographs, some show nothing of a sample
+        mixed = np.random.default_rng(0).permutation(xyz)
+        with ThreadPoolExecutor(4) as pool:
+            few_there = pool.map(lambda shot: _has_few(shot, mixed), doubtful)
+            bare = [shot.name for shot, has_few in zip(doubtful, few_there, strict=True) if has_few]
+    if bare:
         text = (
             f"{len(bare)} photographs have fewer than {FEW_IN_VIEW} sparse points in view, {few(bare)}: their surface "
             "starts from nothing; check their poses, or delete them from the model"

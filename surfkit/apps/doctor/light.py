@@ -26,7 +26,7 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
 
     Args:
         gathered: The data set.
-        known: A look at its photographs, with the colours at the points, by name.
+        known: A look at its photographs, of those to compare with the colours at the points, by name.
         xyz: (S, 3) the points, input frame.
         recipe: To train by.
     """
@@ -52,7 +52,11 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
         return []
     exposure = np.where(light.seen >= MIN_SEEN, light.stops.mean(1), 0)
     darkest, brightest = shots[int(exposure.argmin())].name, shots[int(exposure.argmax())].name
-    text, has_tracks = f"{darkest!r} is the darkest photograph and {brightest!r} the brightest", gathered.capture.groups
+    some = f" of {len(shots)} that were compared" if len(shots) < len(gathered.train) else ""
+    text, has_tracks = (
+        f"{darkest!r} is the darkest photograph and {brightest!r} the brightest{some}",
+        gathered.capture.groups,
+    )
     if has_tracks and not without:
         return [Finding("note", "exposure", f"{text}: {spread}; {looking[0]} makes up for it")]
     settings = without + [each.partition(":")[0] for each in looking]

@@ -55,9 +55,10 @@ class Positions:
 
     def readings(self) -> list[list[Photo]]:
         """The photographs with each choice of the signs that are not known; one list where all are."""
+        axes = self.open  # found by a look at every photograph
         return [
-            [_signed(photo, dict(zip(self.open, signs, strict=True))) for photo in self.photos]
-            for signs in itertools.product((1, -1), repeat=len(self.open))
+            [_signed(photo, dict(zip(axes, signs, strict=True))) for photo in self.photos]
+            for signs in itertools.product((1, -1), repeat=len(axes))
         ]
 
 

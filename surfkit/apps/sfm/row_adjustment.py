@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,11 +27,14 @@ from surfkit.apps.sfm.georeference import centres_of
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
+from surfkit.core.events import Progress, emit
 
 FIRST_MS = 30.0
 """A readout time to begin with where none is known."""
 MIN_MS, MAX_MS = 5.0, 200.0
 """An estimate of less is that of a shutter as good as global; no camera takes longer."""
+SEARCHING_PHASE, CORRECTING_PHASE = "looking for a rolling shutter", "correcting the rolling shutter"
+"""What is done while cameras are adjusted."""
 SECANTS = 2
 """Steps to the readout time that fits best."""
 PASSES, FINAL_PASSES = 2, 3
@@ -78,7 +81,9 @@ class RowAdjustment:
         self.seen = {number: _observed(model, number) for number in sorted(model.reg_image_ids())}
         self.changes: dict[str, np.ndarray] = {}
         self.times: dict[int, float] = {}
+        self.progress = Progress(SEARCHING_PHASE, 0, 1 + SECANTS * PASSES)
         alone = adjust(model, None, photos, settings, math.inf)  # motion may have bent it so far that EXIF fits badly
+        self._tell(1)
         self.base = self.near = model if alone is None else alone
         self.motion = motion_of(centres_of(self.base), photos)
 
@@ -95,6 +100,7 @@ class RowAdjustment:
         for _ in range(SECANTS):
             moved = self._adjusted(model, times)
             if moved is None:
+                self._tell(self.progress.total)
                 return found
             first, model, slopes = slopes, moved, self._slopes(moved)
             for number, (slope, sigma, noise) in slopes.items():
@@ -113,9 +119,11 @@ class RowAdjustment:
     def final(self, times: Mapping[int, float]) -> Any | None:
         """The model with these readout times, seconds, and motions of each photograph near those; None where it does
         not fit."""
+        self.progress = Progress(CORRECTING_PHASE, 0, PASSES + FINAL_PASSES)
         model = self._adjusted(self.near, times)
         for _ in range(FINAL_PASSES):
             if model is None:
+                self._tell(self.progress.total)
                 return None
             self._fit_motions(model)
             model = self._adjusted(model, times, 1)
@@ -161,7 +169,13 @@ class RowAdjustment:
             model = adjust(shifted, None, self.photos, self.settings, math.inf)
             if model is None:
                 return None
+            self._tell(self.progress.done + 1)
         return model
+
+    def _tell(self, done: int) -> None:
+        """Say how many adjustments are done: of thousands of photographs, each takes long."""
+        self.progress = replace(self.progress, done=done)
+        emit(self.progress)
 
     def _slopes(self, model: Any) -> dict[int, tuple[float, float, float]]:
         """For each lens, the derivative of half the sum of squares by its readout time, the standard deviation of a
@@ -262,14 +276,16 @@ def _observed(model: Any, number: int) -> _Seen:
 
 def _points(model: Any, numbers: list[int]) -> np.ndarray:
     """(K, 3) places of points."""
-    return np.array([model.points3D[number].xyz for number in numbers], np.float64).reshape(-1, 3)
+    points = model.points3D  # made anew each time that it is asked for
+    return np.array([points[number].xyz for number in numbers], np.float64).reshape(-1, 3)
 
 
 def _residuals(model: Any, number: int, seen: _Seen) -> tuple[np.ndarray, np.ndarray]:
     """(K, 2) observations of the model less where it puts them, and (K, 3) their points in the camera's frame."""
     image = model.image(number)
     local = np.asarray(image.cam_from_world() * _points(model, seen.points)).reshape(-1, 3)
-    there = np.array([image.points2D[int(row)].xy for row in seen.rows], np.float64).reshape(-1, 2)
+    spots = image.points2D
+    there = np.array([spots[int(row)].xy for row in seen.rows], np.float64).reshape(-1, 2)
     return there - np.asarray(model.cameras[seen.camera].img_from_cam(local)).reshape(-1, 2), local
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.base import Reader
-from surfkit.io.datasets.colmap_files import MIN_ENTRY_BYTES, cut_off, refuse_cut_off
+from surfkit.io.datasets.colmap_files import MIN_ENTRY_BYTES, SPOT, cut_off, refuse_cut_off, spots_of_images
 from surfkit.io.datasets.data import Data, nearest
 from surfkit.io.datasets.georeference_file import Georeference, on_the_map, read_placed
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, load_pycolmap
@@ -26,6 +26,8 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 MODEL_PARENT_FOLDERS = ("sparse", "colmap/sparse")
 """Where COLMAP numbers the models of photographs that it could not connect."""
 MODEL_SUFFIXES = (".bin", ".txt")
+NO_POINT = np.uint64(2**64 - 1)
+"""Number of the sparse point of a feature that has none."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,29 @@ class COLMAP(Reader):
         folder = self.model_folder(data)
         model, placed = _reconstruction(folder), _placed(data.path, folder)
         points = sorted(model.points3D.items())
-        row = {number: at for at, (number, _) in enumerate(points)}
+        spots, numbers = _spots(folder, model), np.array([number for number, _ in points], np.uint64)
         seen = {}
-        for image in model.images.values():
-            spots = [spot for spot in image.points2D if spot.point3D_id in row]
-            rows = np.array([row[spot.point3D_id] for spot in spots], np.int64)
-            seen[image.name] = (rows, np.array([spot.xy for spot in spots], np.float64).reshape(-1, 2))
+        for number, image in model.images.items():
+            xy, shown = spots[number]["xy"], spots[number]["point"]
+            rows = np.searchsorted(numbers, shown)
+            known = np.append(numbers, NO_POINT)[rows] == shown
+            known &= shown != NO_POINT
+            seen[image.name] = (rows[known], np.array(xy[known], np.float64))
         xyz = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
         xyz += 0 if placed is None else placed.offset
         error = np.array([point.error for _, point in points], np.float64)
         cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
         return Tracks(xyz, np.where(np.isfinite(xyz).all(1), error, np.inf), seen, cameras)
+
+
+def _spots(folder: Path, model: Any) -> dict[int, np.ndarray]:
+    """(K,) `SPOT` of each image of a model, by its number."""
+    if not _lacking(folder, ".bin"):
+        return spots_of_images(folder / "images.bin")
+    return {
+        number: np.array([(spot.xy, spot.point3D_id) for spot in image.points2D], SPOT)
+        for number, image in model.images.items()
+    }
 
 
 @dataclass(frozen=True)

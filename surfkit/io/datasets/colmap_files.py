@@ -10,12 +10,16 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from surfkit.core.check import BadInput
 
 MIN_ENTRY_BYTES = {"cameras": 40, "images": 73, "points3D": 51}
 """The files of a model, and the fewest bytes that an entry of the binary one takes."""
 MIN_RIG_ENTRY_BYTES = {"rigs": 8, "frames": 68}
 """Further files of models with rigs."""
+SPOT = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+"""What images.bin has of a place in an image, in pixels, and the number of the sparse point that is seen there."""
 POSE_BYTES = 56
 """Bytes of a rotation and a translation."""
 
@@ -38,6 +42,17 @@ def refuse_cut_off(folder: Path) -> None:
             cut.append(path)
     if cut:
         raise cut_off(*cut)
+
+
+def spots_of_images(path: Path) -> dict[int, np.ndarray]:
+    """(K,) `SPOT` by the number of the image, of a whole images.bin: millions, of which pycolmap makes objects."""
+    raw, found, at = path.read_bytes(), {}, 8
+    for _ in range(_LONG(raw, 0)[0]):
+        name = raw.index(b"\0", at + 64)
+        count = _LONG(raw, name + 1)[0]
+        found[_SHORT(raw, at)[0]] = np.frombuffer(raw, SPOT, count, name + 9)
+        at = name + 9 + SPOT.itemsize * count
+    return found
 
 
 def cut_off(path: Path, *others: Path) -> BadInput:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,18 +14,21 @@ from surfkit.scene.photos import read_exif_tags
 EXIF_IFD = 0x8769
 MAKE_TAG, MODEL_TAG, FOCAL_MM_TAG, BODY_SERIAL_TAG, LENS_SERIAL_TAG = 0x010F, 0x0110, 0x920A, 0xA431, 0xA435
 """Tags of EXIF."""
+FULL_FOLDER = re.compile(r"[1-9]\d\d[A-Z0-9_]{5}")
+"""Name of a folder as cameras number them (DCF): they begin a new one, such as 101MEDIA, when one is full."""
 
 
 def cameras_of(shots: Sequence[RawImage]) -> list[str]:
     """A name for the camera of each photograph: photographs of one camera, with one lens, have the same.
 
     By EXIF: make, model, serial numbers of body and lens, focal length. Without a serial number, equal cameras are told
-    apart by the folder of the photographs. Without make and model, by the folder and the data set's own camera; where
-    that has a camera for each photograph, by the folder alone.
+    apart by the folder of the photographs; numbered ones beside one another, as 100MEDIA and 101MEDIA, are one. Without
+    make and model, by the folder and the data set's own camera; where that has a camera for each photograph, by the
+    folder alone.
     """
     with ThreadPoolExecutor(4) as pool:
         words = list(pool.map(lambda shot: exif_words(shot.path), shots))
-    folders = [PurePosixPath(shot.name.replace("\\", "/")).parent.as_posix() for shot in shots]
+    folders = [_folder(shot.name) for shot in shots]
     numbers = {one: at + 1 for at, one in enumerate(dict.fromkeys(id(shot.camera) for shot in shots))}
     there: dict[str, Counter[int]] = defaultdict(Counter)
     for shot, folder in zip(shots, folders, strict=True):
@@ -36,6 +40,12 @@ def cameras_of(shots: Sequence[RawImage]) -> list[str]:
         own = exif or (f"camera {numbers[id(shot.camera)]}" if is_shared else "")
         found.append(own if has_serial else f"{own} {place}".strip())
     return found
+
+
+def _folder(name: str) -> str:
+    """The folder of a photograph, or the one above where a camera fills one after the other."""
+    folder = PurePosixPath(name.replace("\\", "/")).parent
+    return (folder.parent if FULL_FOLDER.fullmatch(folder.name) else folder).as_posix()
 
 
 def exif_words(path: Path) -> tuple[str, bool]:

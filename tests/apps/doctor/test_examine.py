@@ -11,6 +11,8 @@ import pytest
 from PIL import Image
 
 from surfkit.appearance.exposure import Exposure
+from surfkit.apps.doctor import examine as examine_module
+from surfkit.apps.doctor import geometry
 from surfkit.apps.doctor.examine import examine
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import dump
@@ -477,6 +479,21 @@ def test_every_shot_of_an_odm_project_is_looked_at(farm):
     assert found["damaged-photographs"][0].names == ("view_002.png",)
 
 
+def test_photographs_without_a_model_are_counted_and_named_with_their_folders(farm):
+    """As drones write them: numbered from 1 in each folder, beside other files."""
+    shutil.rmtree(farm / "sparse")
+    for folder, at in (("100MEDIA", 3), ("101MEDIA", 4)):
+        (farm / folder).mkdir()
+        shutil.copy(farm / f"images/view_00{at}.png", farm / folder / "DJI_0001.png")
+    shutil.rmtree(farm / "images")
+    (farm / "101MEDIA/DJI_0002.JPG").write_bytes(b"")
+    (farm / "101MEDIA/._DJI_0001.JPG").write_bytes(b"of macOS")
+    found = examine(Data(farm), recipes()["2dgs"]).diagnosis
+    assert found.found["photographs"].startswith("3, none with a pose")
+    (damaged,) = [one for one in found.findings if one.what == "damaged-photographs"]
+    assert damaged.names == ("101MEDIA/DJI_0002.JPG",) and damaged.text.endswith("again, or leave them out")
+
+
 def test_masks_beside_photographs_are_no_unused_pictures(farm):
     moved = Path(shutil.move(farm, farm.parent / "masks"))
     for name in ("view_003_mask.png", "view_004.mask.png"):
@@ -498,3 +515,15 @@ def test_light_that_differs_is_told_with_figures(tmp_path):
     darkest = re.search("'view_(\\d+).png' is the darkest", light.text)
     assert int(darkest[1]) % 2 == 0, "every other one, from the first on"
     assert "exposure" not in told(folder, quick=True)
+
+
+def test_light_of_many_photographs_is_compared_where_some_of_them_are(tmp_path, monkeypatch):
+    """Points drawn from the whole scene are too few in each photograph to tell."""
+    folder = tmp_path / "tracked"
+    write_colmap(folder, photograph(FLIGHT), tracks=True)
+    brightened(folder)
+    monkeypatch.setattr(examine_module, "sampled", lambda shots: shots[4:10])
+    monkeypatch.setattr(geometry, "COMPARED_POINTS", 40)
+    (light,) = told(folder)["exposure"]
+    named = re.findall(r"'view_(\d+).png'", light.text)
+    assert all(4 <= int(at) < 10 for at in named) and " the brightest of 6 that were compared" in light.text

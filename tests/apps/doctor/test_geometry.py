@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surfkit.apps.doctor import geometry
 from surfkit.apps.doctor.coverage_gaps import holes
-from surfkit.apps.doctor.geometry import places
+from surfkit.apps.doctor.geometry import places, points_in_common, survey
 from surfkit.io.datasets.raw_dataset import RawImage, load_pycolmap
 
 
@@ -39,3 +40,29 @@ def test_a_hole_is_told_where_it_is_also_far_from_the_origin():
         (found,) = holes(ground * size + place, centres * size + place)
         spot = [float(value) for value in found.text.partition("(")[2].partition(")")[0].split(", ")]
         assert np.abs((np.array(spot) - place) / size - (120, 80, 0)).max() < 5, found.text
+
+
+def strip(count):
+    """Photographs in a row, each of 100 sparse points of its own, and of a few of its neighbours."""
+    camera = load_pycolmap().Camera(model="PINHOLE", width=100, height=80, params=[50, 50, 50, 40])
+    shots, draw = [], np.random.default_rng(0)
+    for at in range(count):
+        pose = np.eye(4)
+        pose[:3, 3] = -4.0 * at, 0, 5.0
+        shots.append(RawImage(f"{at:04d}", pose, camera, Path("a")))
+    return shots, draw.uniform([-2, -3, -0.2], [4.0 * count - 2, 3, 0.2], (100 * count, 3))
+
+
+def test_of_many_photographs_those_without_points_are_told_and_no_others():
+    """A sample of the points has hardly any for each of them."""
+    shots, xyz = strip(1_200)
+    xyz = xyz[np.abs(xyz[:, 0] - 4 * 700) > 12]
+    (bare,) = [one for one in survey(shots, shots, xyz, 0.0).findings if one.what == "cameras-without-points"]
+    assert bare.names == ("0699", "0700", "0701") and len(xyz) > 25 * geometry.SAMPLED_POINTS
+
+
+def test_points_in_common_are_those_of_the_photographs():
+    shots, xyz = strip(1_200)
+    near = points_in_common(shots[500:520], xyz)
+    assert len(near) > 900 and (points_in_common(shots[500:502], xyz)[:, 0] < 4 * 505).all()
+    assert len(points_in_common([shots[0], shots[900]], xyz)) == len(points_in_common([], xyz)) == 0

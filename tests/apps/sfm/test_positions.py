@@ -7,7 +7,7 @@ import pytest
 
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.inspect_photos import Photo
-from surfkit.apps.sfm.positions import settle
+from surfkit.apps.sfm.positions import Positions, settle
 from surfkit.apps.sfm.settings import Settings
 from surfkit.core.check import BadInput
 from surfkit.runs.run_notes import collect_notes
@@ -41,6 +41,13 @@ def test_what_is_whole_stays_and_nothing_is_said(settled):
     found, at, said = settled(photo(position=SOUTH), photo("b.jpg"))
     assert at == [SOUTH, None] and said == "" and found.open == () and found.crs is None
     assert len(found.readings()) == 1
+
+
+def test_signs_are_looked_for_once_and_not_for_each_photograph(monkeypatch):
+    """Of 30,000 photographs with all of them, that took minutes."""
+    looks = []
+    monkeypatch.setattr(Positions, "open", property(lambda positions: looks.append(1) or BOTH))
+    assert len(Positions([photo(f"{at}.jpg", SOUTH) for at in range(50)]).readings()) == 4 and len(looks) == 1
 
 
 def test_xmp_gives_positions_signs_and_altitudes(settled):

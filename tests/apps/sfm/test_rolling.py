@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from flight import FOCAL, HEIGHT, WIDTH, Flight, reconstructed
+from listening import listening
 from PIL import Image
 
+from surfkit.apps.sfm import row_adjustment
 from surfkit.apps.sfm.camera_motion import motion_of, seconds
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint
 from surfkit.apps.sfm.dataset_export import undistorted
@@ -22,6 +24,7 @@ from surfkit.apps.sfm.row_motion import RowMotion
 from surfkit.apps.sfm.settings import Settings
 from surfkit.cli import main
 from surfkit.core.check import BadInput
+from surfkit.core.events import Progress
 from surfkit.scene.earth import from_utm
 from surfkit.testing.write_exif import write_exif
 from tests.apps.sfm.pictures import looking, picture, save
@@ -114,6 +117,19 @@ def test_a_global_shutter_is_left_alone(tmp_path):
         "correcting it does not make the photographs agree better",
     )
     assert abs(what.lenses["1"].estimate_ms[0]) < 5
+
+
+def test_adjustments_are_told_as_they_are_done(rolled, monkeypatch):
+    """Each takes long where there are thousands of photographs."""
+    _, photos, model = rolled
+    left = iter([model] * 7)
+    monkeypatch.setattr(row_adjustment, "adjust", lambda *_: next(left, None))
+    with listening(Progress) as told:
+        search = row_adjustment.RowAdjustment(model, photos, Settings())
+        search.estimate(dict.fromkeys(model.cameras))
+        assert search.final(dict.fromkeys(model.cameras, READOUT_S)) is None
+    looked = [Progress("looking for a rolling shutter", done, 5) for done in range(1, 6)]
+    assert told == [*looked, *(Progress("correcting the rolling shutter", done, 5) for done in (1, 2, 5))]
 
 
 def test_a_drone_of_known_readout_time_that_stops_is_left_alone():

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.io.datasets import undistort
+from surfkit.io.datasets import colmap, undistort
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.io.datasets.read import observations, read
@@ -210,6 +210,24 @@ def test_distorted_cameras_are_undistorted(farm, lens):
         local = tracks.xyz[seen.points] @ pose[:3, :3].T + pose[:3, 3]
         pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         np.testing.assert_allclose(seen.at * (camera.width, camera.height), pixels, atol=1e-3)
+
+
+def test_a_binary_model_has_the_tracks_of_a_text_model_without_an_object_for_each(farm, monkeypatch):
+    """A survey of thousands of photographs has millions of observations."""
+    model = farm / "sparse/0"
+    text = colmap.COLMAP().tracks(Data(farm))
+    loaded = load_pycolmap().Reconstruction(str(model))
+    loaded.delete_point3D(min(loaded.points3D))  # its features show no point any more
+    loaded.write_binary(str(model))
+    for path in model.glob("*.txt"):
+        path.unlink()
+    monkeypatch.setattr(load_pycolmap().Image, "points2D", property(lambda image: pytest.fail("one object for each")))
+    binary = colmap.COLMAP().tracks(Data(farm))
+    assert len(binary.xyz) == len(text.xyz) - 1 and sum(len(rows) for rows, _ in text.seen.values()) > 100
+    for name, (rows, pixels) in text.seen.items():
+        kept = rows > 0
+        np.testing.assert_array_equal(binary.seen[name][0], rows[kept] - 1)
+        np.testing.assert_array_equal(binary.seen[name][1], pixels[kept])
 
 
 def test_undistorted_photographs_are_made_once_and_made_anew_when_something_changed(farm, monkeypatch):

@@ -43,6 +43,17 @@ def test_exif_tells_cameras_apart(shot):
     assert names[4:] == ["DJI FC6310 in a/", "DJI FC6310 in b/", "X"]
 
 
+def test_folders_that_a_camera_numbers_are_of_one_camera(shot):
+    """It begins a new one when one is full; those of two cards lie in folders of their own."""
+    dji = {MAKE: "DJI", MODEL: "FC6310"}
+    names = ["100MEDIA/1.jpg", "101MEDIA/1.jpg", "east/100MEDIA/1.jpg", "east/101_0002/1.jpg", "1000MEDIA/1.jpg"]
+    assert cameras_of([shot(name, ONE, dji) for name in names]) == [
+        *["DJI FC6310"] * 2,
+        *["DJI FC6310 in east/"] * 2,
+        "DJI FC6310 in 1000MEDIA/",
+    ]
+
+
 def test_without_exif_the_data_set_does(shot):
     shots = [
         shot("1.png"),
