@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,15 +17,12 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.registry import name_of
 from surfkit.io.datasets.panoramas import points_remedy
-from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.io.datasets.read import observations
 from surfkit.raster.api import Maps
 from surfkit.runs.folder import Run, RunStage
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
-Shot = TypeVar("Shot", View, RawImage)
-"""A photograph."""
 GROUPS, GROUP = 5, 20
 """Of photographs, and how many each has, that are looked at for a warning."""
 
@@ -104,7 +101,7 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
     if tracks.is_empty:
         say("light of the photographs: not known, as nothing tells which show which points; colours stay as they are")
         return LightRecord({}, {}, 0.0, None, is_used=False)
-    some = scene.train if is_wanted else sampled(scene.train)
+    some = scene.train if is_wanted else sampled(scene.train, tracks)
     for views in [scene.train] if len(some) == len(scene.train) else [some, scene.train]:  # a few may only seem uneven
         light = light_by_tracks(views, tracks)
         if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
@@ -126,16 +123,31 @@ def warn_of_light(run: Run, scene: Scene) -> None:
     settings = run.recipe.without_appearance
     if not settings or (tracks := observations(run.data, scene)).is_empty:
         return
-    if (spread := LightSpread.of(light_by_tracks(sampled(scene.train), tracks))).is_uneven:
+    if (spread := LightSpread.of(light_by_tracks(sampled(scene.train, tracks), tracks))).is_uneven:
         emit(Warned(spread.remedy(True, settings)))
 
 
-def sampled(views: Sequence[Shot]) -> Sequence[Shot]:
-    """Photographs that tell how far light differs: of many, groups that follow one another in the order of names."""
+def sampled(views: Sequence[View], tracks: Observations) -> Sequence[View]:
+    """Photographs that tell how far light differs: of many, some and for each those that share most points with it.
+
+    Neighbours by their names would be of one flight; places that several flights show are where flights differ.
+    """
     if len(views) <= GROUPS * GROUP:
         return views
-    starts = np.linspace(0, len(views) - GROUP, GROUPS).astype(int)
-    return tuple(view for start in starts for view in views[start : start + GROUP])
+    chosen = set[int]()
+    for first in np.linspace(0, len(views) - 1, GROUPS).astype(int):
+        is_shown = np.zeros(len(tracks.xyz), bool)
+        is_shown[shown_by(tracks, views[first])] = True
+        shared = np.array([np.count_nonzero(is_shown[shown_by(tracks, view)]) for view in views])
+        shared[list(chosen)] = -1
+        chosen |= {*np.argsort(-shared, kind="stable")[:GROUP].tolist()}
+    return tuple(views[at] for at in sorted(chosen))
+
+
+def shown_by(tracks: Observations, view: View) -> np.ndarray:
+    """(K,) int64 rows of the sparse points that a photograph shows."""
+    seen = tracks.seen.get(view.name)
+    return np.zeros(0, np.int64) if seen is None else seen.points
 
 
 def light_by_tracks(views: Sequence[View], tracks: Observations) -> TrackLight:
@@ -217,10 +229,14 @@ def held_out_response(run: Run, stage: RunStage) -> Callable[[View, Maps], Maps]
     model = next(seeing).stage.appearance
     if model is None or not model.needs_light or not run.light.exists():
         return None
-    cameras = read_json(run.light, LightRecord).cameras
+    record = read_json(run.light, LightRecord)
+    cameras, folders = record.cameras, dict[str, str]()
+    for name, photograph in record.photographs.items():
+        folders.setdefault(_folder(name), photograph.camera)
 
     def respond(view: View, maps: Maps) -> Maps:
-        camera = cameras.get(view.taken_by)
+        # Earlier versions called cameras otherwise: then it is that of the other photographs of the folder.
+        camera = cameras.get(view.taken_by) or cameras.get(folders.get(_folder(view.name), ""))
         if camera is None:
             return maps
         numbers, color = model.begin_with(_photo_light([(0.0, 0.0, 0.0)], [camera]))[0], maps.need("color")
@@ -228,6 +244,11 @@ def held_out_response(run: Run, stage: RunStage) -> Callable[[View, Maps], Maps]
             return replace(maps, color=model(numbers.to(color), color, view.camera))
 
     return respond if cameras else None
+
+
+def _folder(name: str) -> str:
+    """Of a photograph."""
+    return name.replace("\\", "/").rpartition("/")[0]
 
 
 def _photo_light(stops: Sequence[tuple[float, float, float]], cameras: Sequence[CameraNumbers]) -> PhotoLight:
