@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from surfkit.runs.folder import Run, RunStage
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Scene, View
 
+Shot = TypeVar("Shot")
+"""A photograph."""
 GROUPS, GROUP = 5, 20
 """Of photographs, and how many each has, that are looked at for a warning."""
 
@@ -101,7 +103,7 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
     if tracks.is_empty:
         say("light of the photographs: not known, as nothing tells which show which points; colours stay as they are")
         return LightRecord({}, {}, 0.0, None, is_used=False)
-    some = scene.train if is_wanted else sampled(scene.train, tracks)
+    some = scene.train if is_wanted else sampled_by_tracks(scene.train, tracks)
     for views in [scene.train] if len(some) == len(scene.train) else [some, scene.train]:  # a few may only seem uneven
         light = light_by_tracks(views, tracks)
         if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
@@ -123,31 +125,38 @@ def warn_of_light(run: Run, scene: Scene) -> None:
     settings = run.recipe.without_appearance
     if not settings or (tracks := observations(run.data, scene)).is_empty:
         return
-    if (spread := LightSpread.of(light_by_tracks(sampled(scene.train, tracks), tracks))).is_uneven:
+    if (spread := LightSpread.of(light_by_tracks(sampled_by_tracks(scene.train, tracks), tracks))).is_uneven:
         emit(Warned(spread.remedy(True, settings)))
 
 
-def sampled(views: Sequence[View], tracks: Observations) -> Sequence[View]:
+def sampled(shots: Sequence[Shot], points: int, shown_by: Callable[[Shot], np.ndarray]) -> Sequence[Shot]:
     """Photographs that tell how far light differs: of many, some and for each those that share most points with it.
 
     Neighbours by their names would be of one flight; places that several flights show are where flights differ.
+
+    Args:
+        shots: Photographs.
+        points: How many points there are.
+        shown_by: (K,) int64 which of them a photograph shows.
     """
-    if len(views) <= GROUPS * GROUP:
-        return views
-    chosen = set[int]()
-    for first in np.linspace(0, len(views) - 1, GROUPS).astype(int):
-        is_shown = np.zeros(len(tracks.xyz), bool)
-        is_shown[shown_by(tracks, views[first])] = True
-        shared = np.array([np.count_nonzero(is_shown[shown_by(tracks, view)]) for view in views])
+    if len(shots) <= GROUPS * GROUP:
+        return shots
+    chosen, shown = set[int](), [shown_by(shot) for shot in shots]
+    for first in np.linspace(0, len(shots) - 1, GROUPS).astype(int):
+        is_shown = np.zeros(points, bool)
+        is_shown[shown[first]] = True
+        shared = np.array([np.count_nonzero(is_shown[rows]) for rows in shown])
         shared[list(chosen)] = -1
         chosen |= {*np.argsort(-shared, kind="stable")[:GROUP].tolist()}
-    return tuple(views[at] for at in sorted(chosen))
+    return tuple(shots[at] for at in sorted(chosen))
 
 
-def shown_by(tracks: Observations, view: View) -> np.ndarray:
-    """(K,) int64 rows of the sparse points that a photograph shows."""
-    seen = tracks.seen.get(view.name)
-    return np.zeros(0, np.int64) if seen is None else seen.points
+def sampled_by_tracks(views: Sequence[View], tracks: Observations) -> Sequence[View]:
+    """See `sampled`, by the sparse points that they are known to show."""
+    none = np.zeros(0, np.int64)
+    return sampled(
+        views, len(tracks.xyz), lambda view: tracks.seen[view.name].points if view.name in tracks.seen else none
+    )
 
 
 def light_by_tracks(views: Sequence[View], tracks: Observations) -> TrackLight:

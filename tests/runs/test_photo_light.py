@@ -191,7 +191,7 @@ def test_even_light_changes_nothing_where_only_uneven_light_is_looked_for(data, 
 
 def test_light_that_is_uneven_in_some_photographs_alone_changes_nothing(data, recipe, tmp_path, monkeypatch, capsys):
     """All are looked at before colours are changed in all: a few tell response curves badly."""
-    monkeypatch.setattr(photo_light, "sampled", lambda views, tracks: views[:5])
+    monkeypatch.setattr(photo_light, "sampled_by_tracks", lambda views, tracks: views[:5])
     looked = []
 
     def fit(views, tracks):

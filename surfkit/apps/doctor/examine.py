@@ -16,7 +16,7 @@ from surfkit.apps.doctor.estimate import ResourceEstimate
 from surfkit.apps.doctor.examine_photos import Photograph, PhotoToExamine, look_at
 from surfkit.apps.doctor.finding import FINDING_LEVELS, Finding, of_each
 from surfkit.apps.doctor.gather import Gathered, gather
-from surfkit.apps.doctor.geometry import Geometry, points_in_common, seen_by, survey
+from surfkit.apps.doctor.geometry import Geometry, points_in_common, points_in_view, seen_by, survey
 from surfkit.apps.doctor.light import uneven_light
 from surfkit.apps.doctor.priors import priors
 from surfkit.core.check import BadInput, few
@@ -99,7 +99,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
     seconds, peak = time.perf_counter() - start, peak_memory_bytes()
     geometry = survey(gathered.capture.shots, gathered.train, gathered.capture.xyz, recipe.pretrain.near)
     sound = [shot for shot in gathered.train if shot.name in geometry.sound]
-    lit = () if quick else sampled(sound)
+    lit = () if quick else sampled(sound, *points_in_view(gathered.capture.xyz))
     compared = points_in_common(lit, gathered.capture.xyz)
     looks = _look(gathered, {shot.name for shot in lit}, compared, quick, told)
     known = {shot.name: looks[shot.path] for shot in gathered.capture.shots if shot.path in looks}

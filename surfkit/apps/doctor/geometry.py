@@ -19,6 +19,8 @@ SAMPLED_POINTS = 4_000
 """Sparse points, evenly drawn, that stand for all of them."""
 COMPARED_POINTS, CANDIDATE_POINTS = 1_000, 200_000
 """Sparse points at which the colours of photographs are compared, and out of which they are chosen."""
+SHARED_POINTS = 20_000
+"""Sparse points that tell which photographs show the same places."""
 MAX_RAY_OVERSHOOT = 0.3
 """Share of the image by which a ray may miss it before its distortion: polynomials fold far rays back in."""
 FAR_CAMERA = 25.0
@@ -141,6 +143,13 @@ def points_in_common(shots: Sequence[RawImage], xyz: np.ndarray) -> np.ndarray:
     for shot in shots:
         counts += np.isfinite(places(shot, some)[0]).all(1)
     return some[np.flatnonzero(counts > 1)[:COMPARED_POINTS]]
+
+
+def points_in_view(xyz: np.ndarray) -> tuple[int, Callable[[RawImage], np.ndarray]]:
+    """How many of (P, 3) sparse points are looked for, drawn at random, and which of these, (K,), a photograph has in
+    view, if nothing hides them."""
+    some = xyz[np.random.default_rng(1).permutation(len(xyz))[:SHARED_POINTS]]
+    return len(some), lambda shot: np.flatnonzero(np.isfinite(places(shot, some)[0]).all(1))
 
 
 def seen_by(shot: RawImage, xyz: np.ndarray) -> Callable[[], np.ndarray]:

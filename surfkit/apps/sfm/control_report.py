@@ -37,10 +37,10 @@ def warnings_of(where: ControlResiduals) -> Iterator[str]:
     """What is left out, a line for each kind."""
     sure = [mark for mark in where.wrong_marks if mark.certain]
     for mark in sure[:LISTED_MARKS]:
-        off = "behind it" if mark.pixels is None else f"{mark.pixels:.1f} px away"
+        there = "behind it" if mark.pixels is None else f"{mark.pixels:.1f} px away"
         yield (
             f"the mark of {mark.point!r} in {mark.photograph!r} is left out: by the marks in other photographs the "
-            f"point is {off}"
+            f"point is {there}"
         )
     if len(sure) > LISTED_MARKS:
         yield f"{len(sure) - LISTED_MARKS} more marks are left out: see wrong_marks in the report"

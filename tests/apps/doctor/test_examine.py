@@ -522,7 +522,7 @@ def test_light_of_many_photographs_is_compared_where_some_of_them_are(tmp_path, 
     folder = tmp_path / "tracked"
     write_colmap(folder, photograph(FLIGHT), tracks=True)
     brightened(folder)
-    monkeypatch.setattr(examine_module, "sampled", lambda shots: shots[4:10])
+    monkeypatch.setattr(examine_module, "sampled", lambda shots, *_: shots[4:10])
     monkeypatch.setattr(geometry, "COMPARED_POINTS", 40)
     (light,) = told(folder)["exposure"]
     named = re.findall(r"'view_(\d+).png'", light.text)
