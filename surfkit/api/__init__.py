@@ -15,6 +15,7 @@ from surfkit.api.run import TrainedRun, open_run
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import say
+from surfkit.core.fit import fit
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs import pipeline
@@ -77,6 +78,7 @@ def train(
         Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
     """
     chosen, is_file = get_recipe(recipe), str(recipe).endswith(".json")
+    steps, folder, device = fit(int | None, steps, "steps"), fit(Path, out, "out"), str(device)
     given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
     if steps is None and not is_file and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
         count = len(given.train)
@@ -86,5 +88,5 @@ def train(
     chosen = chosen if steps is None else with_steps(chosen, steps)
     with listening(on_step):
         points = PointsOn(points_on, None if scratch is None else Path(scratch))
-        pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache, points=points))
-    return open_run(out, device=device)
+        pipeline.run(chosen, given.data, folder, Compute(device), caches=CacheSettings(cache, points=points))
+    return open_run(folder, device=device)

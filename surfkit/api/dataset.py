@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 
 from surfkit.api.listen import heard
 from surfkit.core.check import BadInput
-from surfkit.core.registry import unknown
+from surfkit.core.fit import fit, settings_of
 from surfkit.io.datasets.data import Data, ReadSettings
 from surfkit.io.datasets.read import read as read_scene
 from surfkit.scene.camera import Camera
@@ -100,15 +100,6 @@ def read(path: str | Path, **options: Any) -> Dataset:
     Raises:
         BadInput: Something is missing, damaged or not supported.
     """
-    known = [each.name for each in fields(ReadSettings)]
-    for name in options:
-        if name not in known:
-            raise BadInput(f"read: {unknown('option', name, known)}")
-    options = {name: Path(it) if isinstance(it, str) and name in PATHS else it for name, it in options.items()}
-    data = ReadSettings(**options).of(Path(path))
+    data = settings_of(ReadSettings, options, "read", "option").of(fit(Path, path, "read"))
     with heard() as texts:
         return Dataset(data, read_scene(data), tuple(texts))
-
-
-PATHS = {"test_list", "images", "masks", "model", "test_data"}
-"""Options of `read` that are paths."""

@@ -14,8 +14,9 @@ from surfkit.api.dataset import Dataset
 from surfkit.api.results import Figures, RunMesh
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.core.fit import fit, settings_of
 from surfkit.core.lock import locked
-from surfkit.core.registry import components, find, unknown
+from surfkit.core.registry import components, find
 from surfkit.core.tree import evolve
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure_geometry import measure_geometry
@@ -148,7 +149,7 @@ class TrainedRun:
         ctx, made = self._loaded
         run, scene = ctx.run, ctx.scene
         written = {each.name for each in fields(MeshOutput)}
-        output = MeshOutput(**{name: value for name, value in settings.items() if name in written})
+        output = settings_of(MeshOutput, {name: it for name, it in settings.items() if name in written}, "mesh")
         own = {name: value for name, value in settings.items() if name not in written}
         if mesher is not None or own:
             refuse_mesher(run.out)
@@ -196,16 +197,12 @@ class TrainedRun:
                 refuse_not_drawn(run)
                 found = evaluate(run, made, ctx.scene)
                 return Figures({name: value for name, value in found.items() if name not in ("geometry", "mesh")})
-            known = [each.name for each in fields(Comparison)]
-            for name in settings:
-                if name not in known:
-                    raise BadInput(f"evaluate: {unknown('setting', name, known)}")
+            comparison = settings_of(Comparison, settings, "evaluate")
             if not (run.mesh.exists() and run.mesh_record.exists()):
                 raise BadInput(f"{run.out}: no {run.mesh.name} of its model in it; mesh() makes it")
             folder = run.out / "geometry"
-            found = measure_geometry(
-                (run.mesh, Path(gt)), Comparison(**settings), folder, ctx.scene.train, ctx.scene.frame
-            )
+            files = run.mesh, fit(Path, gt, "evaluate: gt")
+            found = measure_geometry(files, comparison, folder, ctx.scene.train, ctx.scene.frame)
             note_metrics(run.metrics, found)
             return Figures(found)
 

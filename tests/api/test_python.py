@@ -114,6 +114,14 @@ def test_a_step_may_stop_the_run(folder, tmp_path):
         (lambda scene, run: run.evaluate().f1, "f1 was not measured"),
         (lambda scene, run: run.dataset.camera((0, 0, 0), (0, 0, 1)), "give another `up`"),
         (lambda scene, run: surfkit.open(scene), "no run folder"),
+        (lambda scene, run: surfkit.read(scene, scale="4"), "read: scale: expected a number, got .4"),
+        (lambda scene, run: surfkit.read(None), "read: expected a path, got null"),
+        (lambda scene, run: surfkit.train("2dgs", scene, "x", steps=10.5), "steps: expected a whole number, got 10.5"),
+        (lambda scene, run: surfkit.train("2dgs", scene, None), "out: expected a path, got null"),
+        (lambda scene, run: run.mesh(triangles="300"), "mesh: triangles: expected a whole number, got .300"),
+        (lambda scene, run: run.mesh(voxel_px="3"), "voxel_px: expected a number"),
+        (lambda scene, run: run.evaluate(gt=run.out / "mesh.ply", tau="2"), "evaluate: tau: expected a number, got .2"),
+        (lambda scene, run: run.evaluate(gt=np.zeros((3, 3)), tau=2), "evaluate: gt: expected a path, got "),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(page, folder, wrong, said, tmp_path, monkeypatch):
