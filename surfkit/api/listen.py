@@ -12,7 +12,7 @@ from surfkit.runs.run_notes import collect_notes
 from surfkit.train.interrupt import ask_to_stop
 
 OnStep = Callable[[StepDone], None]
-"""Called after each optimisation step. Whatever it raises, the run saves its state and stops, and `train` raises that."""
+"""Called after each optimisation step. Whatever it raises, the run saves its state and stops, and `train` raises it."""
 
 
 class Listener:

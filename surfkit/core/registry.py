@@ -120,8 +120,8 @@ def components(base: type[C]) -> dict[str, type[C]]:
         if name in found:
             other, first = found[name]
             raise BadInput(
-                f"two packages offer a {base.__name__} named {name!r}: {_where(first)} ({other}) and {_where(cls)} "
-                f"({owner}); uninstall one, or leave it out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
+                f"two packages offer a {base.__name__} named {name!r}: {class_path(first)} ({other}) and "
+                f"{class_path(cls)} ({owner}); uninstall one, or leave it out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
             )
         found[name] = (owner, cls)
     return {name: cls for name, (_, cls) in sorted(found.items())}
@@ -191,7 +191,7 @@ def name_of(part: Component) -> str:
     for _, name, cls in offered("surfkit_components"):
         if type(part) is cls:
             return name
-    raise BadInput(f"no plugin in use offers {_where(type(part))}; return it from a surfkit_components hook")
+    raise BadInput(f"no plugin in use offers {class_path(type(part))}; return it from a surfkit_components hook")
 
 
 def kind_of(cls: type[Component]) -> type[Component]:
@@ -292,7 +292,7 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
                 f"{name!r} is {repr(value)[:80]}, and neither a dataclass with a method run() nor a surfkit.LazyCommand"
             )
         if not (value.__doc__ or "").strip() or (value.__doc__ or "").startswith(f"{value.__name__}("):
-            raise BadInput(f"{_where(value)} has no docstring; its first line is what `surfkit --help` shows")
+            raise BadInput(f"{class_path(value)} has no docstring; its first line is what `surfkit --help` shows")
     if hook != "surfkit_components":
         return
     if not (isinstance(value, type) and issubclass(value, Component)):
@@ -303,19 +303,23 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
 @cache  # all offers are checked again at each look-up, thousands of times in a table of runs
 def _check_class(name: str, cls: type[Component]) -> None:
     if "__dataclass_params__" not in vars(cls) or not vars(cls)["__dataclass_params__"].frozen:
-        raise BadInput(f"{_where(cls)} must be a frozen dataclass to be offered as {name!r}")
+        raise BadInput(f"{class_path(cls)} must be a frozen dataclass to be offered as {name!r}")
     settings = fields(cls)  # type: ignore[arg-type]  # a dataclass, as was just looked at
     if any(field.name == "use" for field in settings):
-        raise BadInput(f"{_where(cls)} has a setting named 'use', which saved recipes keep for the component's name")
+        raise BadInput(
+            f"{class_path(cls)} has a setting named 'use', which saved recipes keep for the component's name"
+        )
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
-        raise BadInput(f"{_where(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
+        raise BadInput(f"{class_path(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
     unset = [f.name for f in settings if f.init and f.default is MISSING and f.default_factory is MISSING]
     if unset:
-        raise BadInput(f"{_where(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part")
+        raise BadInput(
+            f"{class_path(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part"
+        )
     try:
         hints_of(cls)
     except Exception as error:  # a name that is not imported, or whatever else stands for a type
-        raise BadInput(f"{_where(cls)}: a type of its settings cannot be found: {_one_line(error)}") from error
+        raise BadInput(f"{class_path(cls)}: a type of its settings cannot be found: {_one_line(error)}") from error
 
 
 def _unused(name: str, records: Mapping[str, Plugin]) -> str:
@@ -328,5 +332,6 @@ def _one_line(error: BaseException) -> str:
     return text if isinstance(error, BadInput) else f"{type(error).__name__}: {text}"
 
 
-def _where(cls: type) -> str:
+def class_path(cls: type) -> str:
+    """A class as messages name it: its module and its name."""
     return f"{cls.__module__}.{cls.__qualname__}"

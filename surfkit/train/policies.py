@@ -9,7 +9,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import ComparedView, Step, ViewStatistics
+from surfkit.core.check import expect
+from surfkit.core.registry import class_path
+from surfkit.densify.base import ComparedView, Signal, Step, ViewStatistics
 from surfkit.losses.base import ignoring
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.init import SH_C0
@@ -100,10 +102,15 @@ def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:
     signal, processes, total = setup.stage.signal, setup.processes, gradients.signal
     chosen = total if gradients.chosen is None else gradients.chosen
     if processes is None or signal.terms is None:
-        return signal.combine(chosen, total)
+        return _fitting(signal, signal.combine(chosen, total), total)
     rows = own_rows(processes, len(total))
     chosen, total = torch.split(processes.gathered(torch.cat([chosen, total], 1)), 2, 1)
-    return signal.combine(chosen, total)[rows]
+    return _fitting(signal, signal.combine(chosen, total), total)[rows]
+
+
+def _fitting(signal: Signal, combined: Tensor, total: Tensor) -> Tensor:
+    expect(f"{class_path(type(signal))}.combine", combined, tuple(total.shape))
+    return combined
 
 
 def rates_at(setup: StageSetup, state: StageState) -> dict[str, float]:

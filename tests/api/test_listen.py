@@ -1,4 +1,4 @@
-"""A function that is called after each step may raise anything, in any thread; and one process does one thing at once."""
+"""What is called after each step may raise anything, in any thread; one process does one thing at a time."""
 
 import threading
 
