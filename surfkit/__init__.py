@@ -11,7 +11,18 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from surfkit.api import Dataset, Figures, TrainedRun, get_recipe, open_run, read, train
+    from surfkit.api import (
+        Dataset,
+        Figures,
+        TrainedRun,
+        from_arrays,
+        get_recipe,
+        open_run,
+        read,
+        read_splats,
+        save_splats,
+        train,
+    )
     from surfkit.api import open_run as open
     from surfkit.core.check import BadInput, Fault
     from surfkit.core.hooks import LazyCommand, hookimpl
@@ -32,11 +43,14 @@ __all__ = [
     "TrainedRun",
     "__version__",
     "evolve",
+    "from_arrays",
     "get_recipe",
     "hookimpl",
     "open",
     "open_run",
     "read",
+    "read_splats",
+    "save_splats",
     "train",
 ]
 _HOME = {
@@ -49,11 +63,14 @@ _HOME = {
     "Recipe": "surfkit.runs.recipe",
     "TrainedRun": "surfkit.api",
     "evolve": "surfkit.core.tree",
+    "from_arrays": "surfkit.api",
     "get_recipe": "surfkit.api",
     "hookimpl": "surfkit.core.hooks",
     "open": "surfkit.api",
     "open_run": "surfkit.api",
     "read": "surfkit.api",
+    "read_splats": "surfkit.api",
+    "save_splats": "surfkit.api",
 }
 
 

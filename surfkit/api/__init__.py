@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from surfkit.api.arrays import from_arrays
 from surfkit.api.dataset import Dataset, read
 from surfkit.api.listen import OnStep, listening
 from surfkit.api.results import Figures, RunMesh
 from surfkit.api.run import TrainedRun, open_run
+from surfkit.api.splats import read_splats, save_splats
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import say
@@ -25,7 +27,20 @@ from surfkit.train.data_cache import CacheSettings
 from surfkit.train.points_on import Place, PointsOn
 from surfkit.train.stage import Stage
 
-__all__ = ["Dataset", "Figures", "OnStep", "RunMesh", "TrainedRun", "get_recipe", "open_run", "read", "train"]
+__all__ = [
+    "Dataset",
+    "Figures",
+    "OnStep",
+    "RunMesh",
+    "TrainedRun",
+    "from_arrays",
+    "get_recipe",
+    "open_run",
+    "read",
+    "read_splats",
+    "save_splats",
+    "train",
+]
 
 
 def get_recipe(name: str | Path | Recipe) -> Recipe:

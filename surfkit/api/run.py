@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from surfkit.api.dataset import Dataset
+from surfkit.api.dataset import Dataset, view_of
 from surfkit.api.results import Figures, RunMesh
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -26,11 +26,10 @@ from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
-from surfkit.runs import pipeline
+from surfkit.runs import journal, pipeline
 from surfkit.runs.context import RunContext
 from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import note_metrics
-from surfkit.runs.journal import record_events
 from surfkit.runs.make_levels import load_levels
 from surfkit.runs.make_mesh import make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate
@@ -52,7 +51,7 @@ def open_run(out: str | Path, *, device: Device = "auto") -> TrainedRun:
     Raises:
         BadInput: It holds no run.
     """
-    return TrainedRun(Path(out), device)
+    return TrainedRun(fit(Path, out, "open"), device)
 
 
 @dataclass
@@ -69,7 +68,12 @@ class TrainedRun:
     _use: ExitStack = field(default_factory=ExitStack, repr=False)
 
     def __post_init__(self) -> None:
+        self.device = str(self.device)
         pipeline.opened(self.out)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To another process goes where it is, and not what is in memory."""
+        return TrainedRun, (self.out, self.device)
 
     def __enter__(self) -> TrainedRun:
         return self
@@ -99,14 +103,21 @@ class TrainedRun:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """All that has been measured, as metrics.json has it."""
-        path = self._loaded[0].run.metrics
+        """All that has been measured, as metrics.json has it; empty where nothing was."""
+        path = pipeline.opened(self.out).metrics
         return read_json(path, dict[str, Any]) if path.exists() else {}
+
+    @property
+    def steps(self) -> list[dict[str, Any]]:
+        """The optimisation steps so far, as events.jsonl has them: `index`, `losses` by their names, `points`, `time`
+        (seconds since 1970) and so on; also of a run that is not finished.
+        """
+        return [line for line in journal.read(self.out / journal.JOURNAL_FILE) if line["event"] == "StepDone"]
 
     @property
     def splats(self) -> SplatTable:
         """The splats, frame of the input: `means` (N, 3), `opacities` (N,), `scales` (N, 2 or 3), `quats` (N, 4) w x y
-        z, `sh0` (N, 3), `sh_rest` (N, K - 1, 3); float32.
+        z, `sh0` (N, 3), `sh_rest` (N, K - 1, 3); float32, positions float64.
 
         Raises:
             BadInput: Its method makes none.
@@ -126,10 +137,9 @@ class TrainedRun:
         Raises:
             BadInput: Nothing can be drawn of what its method makes.
         """
-        ctx, made = self._loaded
+        view, (ctx, made) = view_of(camera, "render"), self._loaded
         refuse_not_drawn(ctx.run)
         assert made.draw is not None, "what is drawn has a way to draw"
-        view = camera if isinstance(camera, View) else View("camera", camera, Path("camera"))
         with torch.no_grad():
             return made.draw(view)
 
@@ -168,7 +178,7 @@ class TrainedRun:
             locked(run.out),
             full_disk_in_one_line(run.out),
             maps as with_maps,
-            record_events(run.out),
+            journal.record_events(run.out),
         ):
             what = mesh_input(with_maps, made, scene, ctx.rasterizer, budget, chosen)
             record = make_mesh(with_maps, maker, output, what, made.last_steps)

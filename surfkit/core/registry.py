@@ -119,9 +119,10 @@ def components(base: type[C]) -> dict[str, type[C]]:
             continue
         if name in found:
             other, first = found[name]
+            two = f"{class_path(first)} ({other}) and {class_path(cls)} ({owner})"
             raise BadInput(
-                f"two packages offer a {base.__name__} named {name!r}: {class_path(first)} ({other}) and "
-                f"{class_path(cls)} ({owner}); uninstall one, or leave it out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
+                f"two packages offer a {base.__name__} named {name!r}: {two}; uninstall one, or leave it out with "
+                "SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
             )
         found[name] = (owner, cls)
     return {name: cls for name, (_, cls) in sorted(found.items())}
