@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from surfkit.api.arrays import from_arrays
+from surfkit.api.compare_surfaces import compare
 from surfkit.api.dataset import Dataset, read
 from surfkit.api.listen import OnStep, listening
 from surfkit.api.results import Figures, RunMesh
 from surfkit.api.run import TrainedRun, open_run
+from surfkit.api.scene_of_arrays import from_arrays
 from surfkit.api.splats import read_splats, save_splats
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -33,6 +34,7 @@ __all__ = [
     "OnStep",
     "RunMesh",
     "TrainedRun",
+    "compare",
     "from_arrays",
     "get_recipe",
     "open_run",

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from surfkit.api.compare_surfaces import Surface, surface_file
 from surfkit.api.dataset import Dataset, view_of
 from surfkit.api.results import Figures, RunMesh
 from surfkit.core.check import BadInput
@@ -184,11 +185,11 @@ class TrainedRun:
             record = make_mesh(with_maps, maker, output, what, made.last_steps)
         return RunMesh.read(run.out / record["files"][0])
 
-    def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:
+    def evaluate(self, gt: Surface | None = None, **settings: Any) -> Figures:
         """Measure: on the held-out photographs, or the run's mesh against the truth.
 
         Args:
-            gt: Point cloud, mesh or raster of heights that is the truth.
+            gt: The truth: a file (point cloud, mesh, raster of heights), (P, 3) points, or a mesh.
             settings: With `gt`: of the comparison, `tau=0.5`, `crop="none"`, `area="site.gpkg"`; see
                 `Comparison`.
 
@@ -211,8 +212,8 @@ class TrainedRun:
             if not (run.mesh.exists() and run.mesh_record.exists()):
                 raise BadInput(f"{run.out}: no {run.mesh.name} of its model in it; mesh() makes it")
             folder = run.out / "geometry"
-            files = run.mesh, fit(Path, gt, "evaluate: gt")
-            found = measure_geometry(files, comparison, folder, ctx.scene.train, ctx.scene.frame)
+            truth = surface_file(gt, folder, "truth")
+            found = measure_geometry((run.mesh, truth), comparison, folder, ctx.scene.train, ctx.scene.frame)
             note_metrics(run.metrics, found)
             return Figures(found)
 

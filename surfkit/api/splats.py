@@ -52,14 +52,14 @@ def save_splats(
     """
     if not isinstance(splats, SplatTable):
         raise BadInput(f"save_splats: expected splats as of run.splats or read_splats, got {type(splats).__name__}")
-    path = fit(Path, path, "save_splats")
-    form = format if isinstance(format, Format) else find(Format, format)() if format else format_for(path)
+    file: Path = fit(Path, path, "save_splats")
+    form = format if isinstance(format, Format) else find(Format, format)() if format else format_for(file)
     if form.wants_tree:
-        raise BadInput(f"{path}: this format takes levels of detail, which only run.export has; choose another")
-    path.parent.mkdir(parents=True, exist_ok=True)
+        raise BadInput(f"{file}: this format takes levels of detail, which only run.export has; choose another")
+    file.parent.mkdir(parents=True, exist_ok=True)
     with heard():
-        form.write(path, splats.on_cpu(), frame)
-    return path
+        form.write(file, splats.on_cpu(), frame)
+    return file
 
 
 def drawn(splats: SplatTable, camera: Camera, frame: Frame, near: float, rasterizer: Rasterizer) -> Maps:
@@ -83,9 +83,8 @@ def drawn(splats: SplatTable, camera: Camera, frame: Frame, near: float, rasteri
         "opacities": splats.opacities,
         "sh": torch.cat([splats.sh0[:, None], splats.sh_rest], 1),
     }
-    local = Splats(splats.kind, **{name: value.detach().float() for name, value in named.items()})
-    if splats.kind == "gaussian":
-        local = Splats(splats.kind, *local.tensors().values(), antialias=splats.antialias)
+    means, quats, scales, opacities, sh = (value.detach().float() for value in named.values())
+    local = Splats(splats.kind, means, quats, scales, opacities, sh, antialias=splats.antialias)
     render = rasterizer.render(local, camera, near, distortion=False)
     names = list(render.maps.present())
     return Maps(**dict(zip(names, _Drawn.apply(render, names, list(named), *named.values()), strict=True)))  # type: ignore[no-untyped-call]

@@ -169,7 +169,7 @@ def require_triangles(mesh: Any) -> None:
         raise BadInput(f"expected a surfkit.Mesh, got {type(mesh).__name__}")
     for name, array, kind in (("vertices", mesh.vertices, np.floating), ("faces", mesh.faces, np.integer)):
         if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, kind):
-            came = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+            came = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
             raise BadInput(
                 f"{name}: expected a numpy array of {'int32' if kind is np.integer else 'float32'}, got {came}"
             )

@@ -209,7 +209,7 @@ def _refuse_weights(path: str, stage: Stage) -> None:
     for key, term in terms.items():
         for index in (1, stage.steps):
             weight: Any = term.weight_at(index, stage.steps)
-            if not isinstance(weight, Real) or not 0 <= weight < math.inf:
+            if not (isinstance(weight, Real) and 0 <= float(weight) < math.inf):
                 shown = f"{weight:g}" if isinstance(weight, Real) else repr(weight)
                 raise BadInput(f"{path}.{key}: its weight in step {index} is {shown}; it must be 0 or more, and finite")
 

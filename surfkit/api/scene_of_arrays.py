@@ -76,7 +76,7 @@ def from_arrays(
         pinhole = _row([lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2]])
         lines["cameras"].append(f"{i} PINHOLE {width} {height} {pinhole}\n")
         lines["images"].append(f"{i} {_row([w, x, y, z, *pose[:3, 3]])} {i} {name}\n\n")
-    for i, (place, color) in enumerate(zip(places, paint.tolist(), strict=True), 1):
+    for i, (place, color) in enumerate(zip(places, list(paint), strict=True), 1):
         lines["points3D"].append(f"{i} {_row(place)} {' '.join(str(int(part)) for part in color)} 0\n")
     for part, text in lines.items():
         (model / f"{part}.txt").write_text("".join(text))
