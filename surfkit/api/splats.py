@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import torch
 from torch import Tensor
@@ -90,13 +92,31 @@ def drawn(splats: SplatTable, camera: Camera, frame: Frame, near: float, rasteri
     return Maps(**dict(zip(names, _Drawn.apply(render, names, list(named), *named.values()), strict=True)))  # type: ignore[no-untyped-call]
 
 
+class _Held:
+    """A view that a graph needs for its way back."""
+
+    def __init__(self, render: Render | None) -> None:
+        self.render = render
+
+
+_HELD: WeakSet[_Held] = WeakSet()
+
+
+@atexit.register
+def _let_go() -> None:
+    """Graphs that a script still holds at its end are not freed by torch, and the compiled code would report that."""
+    for held in list(_HELD):
+        held.render = None
+
+
 class _Drawn(torch.autograd.Function):
     """The maps of a view, with the rasterizer's own way back."""
 
     @staticmethod
     def forward(ctx: Any, render: Render, maps: list[str], splats: list[str], *tensors: Tensor) -> tuple[Tensor, ...]:
         """The maps, in the order of their names."""
-        ctx.render, ctx.maps, ctx.splats = render, maps, splats
+        ctx.held, ctx.maps, ctx.splats = _Held(render), maps, splats
+        _HELD.add(ctx.held)
         ctx.set_materialize_grads(False)
         return tuple(render.maps.present()[name].clone() for name in maps)
 
@@ -104,5 +124,5 @@ class _Drawn(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
         """The gradients by the tensors of the splats."""
         given = {name: grad for name, grad in zip(ctx.maps, grads, strict=True) if grad is not None}
-        found = ctx.render.backward(Maps(**given)).tensors()
+        found = ctx.held.render.backward(Maps(**given)).tensors()
         return (None, None, None, *(found[name] for name in ctx.splats))

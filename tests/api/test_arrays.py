@@ -55,12 +55,24 @@ def test_floats_without_points_train_from_random_points_and_resume(files, tmp_pa
     assert [step["index"] for step in run.steps] == [1, 2, 3, 4]
 
 
+def test_poses_of_another_convention_are_told(files, tmp_path, capsys):
+    given = arrays(files)
+    for at, poses, said in (
+        ("right", given["poses"], ()),
+        ("inverse", np.linalg.inv(given["poses"]), ("world to camera",)),
+        ("flipped", np.diag([1, -1, -1, 1]) @ given["poses"], ("hardly a camera sees any of the 250 points",)),
+    ):
+        scene = surfkit.from_arrays(tmp_path / at, **(given | {"poses": poses}))
+        assert len(scene.findings) == len(said) and all(text in scene.findings[0] for text in said), at
+        assert all(text in capsys.readouterr().err for text in said)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         ({"images": [np.zeros((3, 8, 8), np.uint8)]}, r"images\[0\]: expected shape \(H, W, 3\), got \(3, 8, 8\)"),
         ({"images": [np.full((8, 8, 3), 255.0)]}, "float64 from 255 to 255; give uint8, or floats from 0 to 1"),
-        ({"poses": np.eye(4)[None] * 2}, r"poses\[0\]: the left upper 3 x 3 is no rotation; .*diag"),
+        ({"poses": np.eye(4)[None] * 2}, r"poses\[0\]: the left upper 3 x 3 is no rotation, as with a scale; .*diag"),
         ({"poses": np.eye(4)}, r"poses: expected shape \(1, 4, 4\), got \(4, 4\)"),
         ({"poses": np.eye(4)[None] * np.nan}, "poses: has NaN or Inf"),
         ({"intrinsics": np.eye(4)}, r"intrinsics: expected shape \(1, 3, 3\), got \(4, 4\)"),

@@ -1,6 +1,8 @@
 """Splats in Python: edited, written and read again, and drawn with gradients."""
 
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -69,6 +71,16 @@ def test_colours_are_fitted_in_a_loop_of_ones_own(run):
         optimizer.step()
         errors.append(float(error))
     assert errors[-1] < 0.7 * errors[0]
+
+
+def test_a_script_may_end_with_a_graph_in_its_hands(run):
+    script = (
+        f"import surfkit, dataclasses; run = surfkit.open({str(run.out)!r}); splats = run.splats;"
+        "sh0 = splats.sh0.requires_grad_(); view = run.dataset.train[0];"
+        "maps = run.dataset.draw(dataclasses.replace(splats, sh0=sh0), view)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and not done.stdout + done.stderr
 
 
 def test_a_run_goes_to_another_process(run):
