@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from surfkit.api import open_run as open
     from surfkit.core.check import BadInput, Fault
     from surfkit.core.hooks import LazyCommand, hookimpl
+    from surfkit.core.registry import offer
     from surfkit.core.tree import evolve
     from surfkit.runs.recipe import Recipe
     from surfkit.scene.camera import Camera
@@ -48,6 +49,7 @@ __all__ = [
     "from_arrays",
     "get_recipe",
     "hookimpl",
+    "offer",
     "open",
     "open_run",
     "read",
@@ -69,6 +71,7 @@ _HOME = {
     "from_arrays": "surfkit.api",
     "get_recipe": "surfkit.api",
     "hookimpl": "surfkit.core.hooks",
+    "offer": "surfkit.core.registry",
     "open": "surfkit.api",
     "open_run": "surfkit.api",
     "read": "surfkit.api",

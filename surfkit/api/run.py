@@ -69,7 +69,7 @@ class TrainedRun:
     _use: ExitStack = field(default_factory=ExitStack, repr=False)
 
     def __post_init__(self) -> None:
-        self.device = str(self.device)
+        self.out, self.device = self.out.absolute(), str(self.device)  # also where the current folder changes
         pipeline.opened(self.out)
 
     def __reduce__(self) -> tuple[Any, ...]:

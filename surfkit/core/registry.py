@@ -23,7 +23,7 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.hints import hints_of
-from surfkit.core.hooks import HOOKS, Hooks, LazyCommand
+from surfkit.core.hooks import HOOKS, Hooks, LazyCommand, hookimpl
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
@@ -111,6 +111,44 @@ def reload() -> None:
     _loaded.cache_clear()
 
 
+class _OwnParts:
+    """The parts of a script or a notebook."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, type[Component]] = {}
+
+    @hookimpl
+    def surfkit_components(self) -> Mapping[str, type[Component]]:
+        """What `offer` was given."""
+        return self.parts
+
+
+OWN_PARTS = "this script"
+"""The name of the plugin that has the parts of a script."""
+
+
+def offer(name: str, cls: type[Component]) -> None:
+    """Offer a part of a script or a notebook in this process, as a plugin offers its own; given again, it replaces the
+    one before.
+
+    Args:
+        name: For recipes, such as "my-loss".
+        cls: A frozen dataclass that extends the base class of its kind.
+
+    Raises:
+        BadInput: It is no such class, or another package offers one of its kind under this name.
+    """
+    _check_offer("surfkit_components", name, cls)
+    for owner, known, other in offered("surfkit_components"):
+        if known == name and owner != OWN_PARTS and issubclass(other, kind_of(cls)):
+            raise BadInput(f"offer: {class_path(other)} ({owner}) is named {name!r} already; choose another name")
+    own = plugins().get_plugin(OWN_PARTS)
+    if own is None:
+        own = _OwnParts()
+        plugins().register(own, OWN_PARTS)
+    own.parts[name] = cls
+
+
 def components(base: type[C]) -> dict[str, type[C]]:
     """Every offered subclass of `base`, by name."""
     found: dict[str, tuple[str, type[C]]] = {}
@@ -192,7 +230,10 @@ def name_of(part: Component) -> str:
     for _, name, cls in offered("surfkit_components"):
         if type(part) is cls:
             return name
-    raise BadInput(f"no plugin in use offers {class_path(type(part))}; return it from a surfkit_components hook")
+    raise BadInput(
+        f"no plugin in use offers {class_path(type(part))}; return it from a surfkit_components hook, or in a script "
+        f"call surfkit.offer(NAME, {type(part).__name__})"
+    )
 
 
 def kind_of(cls: type[Component]) -> type[Component]:

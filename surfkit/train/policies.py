@@ -9,7 +9,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from surfkit.core.check import expect
+from surfkit.core.check import BadInput, expect
 from surfkit.core.registry import class_path
 from surfkit.densify.base import ComparedView, Signal, Step, ViewStatistics
 from surfkit.losses.base import ignoring
@@ -109,7 +109,12 @@ def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:
 
 
 def _fitting(signal: Signal, combined: Tensor, total: Tensor) -> Tensor:
-    expect(f"{class_path(type(signal))}.combine", combined, tuple(total.shape))
+    """(N, 2) what a signal gives; BadInput if it has another shape, or makes NaN of what is finite: no point would be
+    added, without a word."""
+    name = f"{class_path(type(signal))}.combine"
+    expect(name, combined, tuple(total.shape))
+    if not combined.sum().isfinite() and total.sum().isfinite():
+        raise BadInput(f"{name}: NaN or Inf, of gradients that are finite; give finite values")
     return combined
 
 

@@ -28,10 +28,12 @@ class BrokenLoss(Loss):
 
 @dataclass(frozen=True)
 class BrokenSignal(Signal):
-    """Gives another number of rows."""
+    """Gives another number of rows, or NaN."""
+
+    how: str = "short"
 
     def combine(self, chosen, total):
-        return total[:5]
+        return total[:5] if self.how == "short" else total / 0 * 0
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ def scene(tmp_path_factory):
         ("pretrain.losses.mine", BrokenLoss("image"), r"losses.mine: expected shape \(\), got \(3, 36, 48\)"),
         ("pretrain.losses.mine", BrokenLoss("weight"), "losses.mine: its weight in step 1 is None"),
         ("pretrain.signal", BrokenSignal(), r"BrokenSignal.combine: expected shape \(\d+, 2\), got \(5, 2\)"),
+        ("pretrain.signal", BrokenSignal("nan"), "BrokenSignal.combine: NaN or Inf, of gradients that are finite"),
         ("pretrain.appearance", BrokenAppearance("count"), r"BrokenAppearance.begin: .* got 1 rows"),
         ("pretrain.appearance", BrokenAppearance("turned"), r"expected shape \(3, 36, 48\), got \(36, 48, 3\)"),
     ],
