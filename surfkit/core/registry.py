@@ -41,6 +41,8 @@ class Component(ABC):  # noqa: B024 (the methods are those of each kind)
 C = TypeVar("C", bound=Component)
 
 
+PLAIN = (bool, int, float, str, tuple, list, dict)
+"""What settings are, beside parts."""
 HOOK_VALUES = {
     "surfkit_recipes": "a surfkit.Recipe",
     "surfkit_tables": "a surfkit.Table",
@@ -351,6 +353,13 @@ def _check_class(name: str, cls: type[Component]) -> None:
         raise BadInput(
             f"{class_path(cls)} has a setting named 'use', which saved recipes keep for the component's name"
         )
+    typed = {name for base in cls.__mro__ for name in vars(base).get("__annotations__", {})}
+    for name, value in vars(cls).items():
+        if not name.startswith("_") and isinstance(value, PLAIN) and name not in typed:
+            raise BadInput(
+                f"{class_path(cls)}: {name} = {value!r} has no type, so it is no setting and is not saved; write "
+                f"{name}: {type(value).__name__} = {value!r}, or ClassVar[{type(value).__name__}] where it is none"
+            )
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         raise BadInput(f"{class_path(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
     unset = [f.name for f in settings if f.init and f.default is MISSING and f.default_factory is MISSING]

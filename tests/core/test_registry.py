@@ -145,3 +145,14 @@ def test_a_part_of_a_script_takes_no_name_of_others(world, bare):
         offer_own("l1", Mine)
     with pytest.raises(BadInput, match="not a name in kebab-case"):
         offer_own("My Loss", Mine)
+
+
+def test_a_setting_without_a_type_is_refused(world, bare):
+    @dataclass(frozen=True)
+    class Mine(world.Loss):
+        """Mine."""
+
+        weight = 0.5
+
+    with pytest.raises(BadInput, match=r"Mine: weight = 0.5 has no type, .* write weight: float = 0.5, or ClassVar"):
+        offer_own("mine", Mine)
