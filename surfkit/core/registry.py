@@ -354,11 +354,11 @@ def _check_class(name: str, cls: type[Component]) -> None:
             f"{class_path(cls)} has a setting named 'use', which saved recipes keep for the component's name"
         )
     typed = {name for base in cls.__mro__ for name in vars(base).get("__annotations__", {})}
-    for name, value in vars(cls).items():
-        if not name.startswith("_") and isinstance(value, PLAIN) and name not in typed:
+    for attribute, value in vars(cls).items():
+        if not attribute.startswith("_") and isinstance(value, PLAIN) and attribute not in typed:
             raise BadInput(
-                f"{class_path(cls)}: {name} = {value!r} has no type, so it is no setting and is not saved; write "
-                f"{name}: {type(value).__name__} = {value!r}, or ClassVar[{type(value).__name__}] where it is none"
+                f"{class_path(cls)}: {attribute} = {value!r} has no type, so it is no setting and is not saved; write "
+                f"{attribute}: {type(value).__name__} = {value!r}, or ClassVar[{type(value).__name__}] where it is none"
             )
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         raise BadInput(f"{class_path(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
