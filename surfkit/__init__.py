@@ -11,10 +11,23 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from surfkit.api import Dataset, Figures, TrainedRun, get_recipe, open_run, read, train
+    from surfkit.api import (
+        Dataset,
+        Figures,
+        TrainedRun,
+        compare,
+        from_arrays,
+        get_recipe,
+        open_run,
+        read,
+        read_splats,
+        save_splats,
+        train,
+    )
     from surfkit.api import open_run as open
     from surfkit.core.check import BadInput, Fault
     from surfkit.core.hooks import LazyCommand, hookimpl
+    from surfkit.core.registry import offer
     from surfkit.core.tree import evolve
     from surfkit.runs.recipe import Recipe
     from surfkit.scene.camera import Camera
@@ -31,12 +44,17 @@ __all__ = [
     "Recipe",
     "TrainedRun",
     "__version__",
+    "compare",
     "evolve",
+    "from_arrays",
     "get_recipe",
     "hookimpl",
+    "offer",
     "open",
     "open_run",
     "read",
+    "read_splats",
+    "save_splats",
     "train",
 ]
 _HOME = {
@@ -48,12 +66,17 @@ _HOME = {
     "LazyCommand": "surfkit.core.hooks",
     "Recipe": "surfkit.runs.recipe",
     "TrainedRun": "surfkit.api",
+    "compare": "surfkit.api",
     "evolve": "surfkit.core.tree",
+    "from_arrays": "surfkit.api",
     "get_recipe": "surfkit.api",
     "hookimpl": "surfkit.core.hooks",
+    "offer": "surfkit.core.registry",
     "open": "surfkit.api",
     "open_run": "surfkit.api",
     "read": "surfkit.api",
+    "read_splats": "surfkit.api",
+    "save_splats": "surfkit.api",
 }
 
 

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from surfkit.api.compare_surfaces import compare
 from surfkit.api.dataset import Dataset, read
 from surfkit.api.listen import OnStep, listening
 from surfkit.api.results import Figures, RunMesh
 from surfkit.api.run import TrainedRun, open_run
+from surfkit.api.scene_of_arrays import from_arrays
+from surfkit.api.splats import read_splats, save_splats
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import say
+from surfkit.core.fit import fit
 from surfkit.core.registry import offered_once, unknown
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs import pipeline
@@ -24,7 +28,21 @@ from surfkit.train.data_cache import CacheSettings
 from surfkit.train.points_on import Place, PointsOn
 from surfkit.train.stage import Stage
 
-__all__ = ["Dataset", "Figures", "OnStep", "RunMesh", "TrainedRun", "get_recipe", "open_run", "read", "train"]
+__all__ = [
+    "Dataset",
+    "Figures",
+    "OnStep",
+    "RunMesh",
+    "TrainedRun",
+    "compare",
+    "from_arrays",
+    "get_recipe",
+    "open_run",
+    "read",
+    "read_splats",
+    "save_splats",
+    "train",
+]
 
 
 def get_recipe(name: str | Path | Recipe) -> Recipe:
@@ -77,6 +95,7 @@ def train(
         Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
     """
     chosen, is_file = get_recipe(recipe), str(recipe).endswith(".json")
+    steps, folder, device = fit(int | None, steps, "steps"), fit(Path, out, "out"), str(device)
     given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
     if steps is None and not is_file and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
         count = len(given.train)
@@ -86,5 +105,5 @@ def train(
     chosen = chosen if steps is None else with_steps(chosen, steps)
     with listening(on_step):
         points = PointsOn(points_on, None if scratch is None else Path(scratch))
-        pipeline.run(chosen, given.data, Path(out), Compute(device), caches=CacheSettings(cache, points=points))
-    return open_run(out, device=device)
+        pipeline.run(chosen, given.data, folder, Compute(device), caches=CacheSettings(cache, points=points))
+    return open_run(folder, device=device)

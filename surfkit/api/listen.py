@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,9 +9,10 @@ from surfkit.core.events import StepDone, Warned
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import plugins
 from surfkit.runs.run_notes import collect_notes
+from surfkit.train.interrupt import ask_to_stop
 
 OnStep = Callable[[StepDone], None]
-"""Called after each optimisation step. It may raise KeyboardInterrupt: the run saves its state and stops."""
+"""Called after each optimisation step. Whatever it raises, the run saves its state and stops, and `train` raises it."""
 
 
 class Listener:
@@ -20,16 +20,19 @@ class Listener:
 
     def __init__(self, on_step: OnStep | None = None) -> None:
         self.on_step = on_step
+        self.raised: BaseException | None = None
         self.texts: list[str] = []
 
     @hookimpl
     def surfkit_event(self, event: object) -> None:
         """Pass a step on, and keep a warning."""
-        if isinstance(event, StepDone) and self.on_step is not None:
+        if isinstance(event, StepDone) and self.on_step is not None and self.raised is None:
             try:
                 self.on_step(event)
-            except KeyboardInterrupt:
-                signal.raise_signal(signal.SIGINT)  # as Ctrl-C: the step is finished, and the state saved
+            except BaseException as error:  # raised when the state is saved; `emit` would only report it
+                self.raised = error
+                if not ask_to_stop():
+                    raise KeyboardInterrupt from error
         if isinstance(event, Warned):
             self.texts.append(event.text)
 
@@ -48,10 +51,14 @@ def heard() -> Iterator[list[str]]:
 
 @contextmanager
 def listening(on_step: OnStep | None) -> Iterator[None]:
-    """Within, `on_step` is called after each step."""
+    """Within, `on_step` is called after each step; what it raises is raised where the run has stopped."""
     listener = Listener(on_step)
     plugins().register(listener)
     try:
         yield
+    except KeyboardInterrupt:
+        if listener.raised is None:
+            raise
+        raise listener.raised from None
     finally:
         plugins().unregister(listener)

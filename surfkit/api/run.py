@@ -10,12 +10,14 @@ from typing import Any
 
 import torch
 
-from surfkit.api.dataset import Dataset
+from surfkit.api.compare_surfaces import Surface, surface_file
+from surfkit.api.dataset import Dataset, view_of
 from surfkit.api.results import Figures, RunMesh
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.core.fit import fit, settings_of
 from surfkit.core.lock import locked
-from surfkit.core.registry import components, find, unknown
+from surfkit.core.registry import components, find
 from surfkit.core.tree import evolve
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure_geometry import measure_geometry
@@ -25,11 +27,10 @@ from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
-from surfkit.runs import pipeline
+from surfkit.runs import journal, pipeline
 from surfkit.runs.context import RunContext
 from surfkit.runs.ensure_depth_maps import with_maps_to_mesh
 from surfkit.runs.folder import note_metrics
-from surfkit.runs.journal import record_events
 from surfkit.runs.make_levels import load_levels
 from surfkit.runs.make_mesh import make_mesh, mesh_input
 from surfkit.runs.measure_run import evaluate
@@ -51,7 +52,7 @@ def open_run(out: str | Path, *, device: Device = "auto") -> TrainedRun:
     Raises:
         BadInput: It holds no run.
     """
-    return TrainedRun(Path(out), device)
+    return TrainedRun(fit(Path, out, "open"), device)
 
 
 @dataclass
@@ -68,7 +69,12 @@ class TrainedRun:
     _use: ExitStack = field(default_factory=ExitStack, repr=False)
 
     def __post_init__(self) -> None:
+        self.out, self.device = self.out.absolute(), str(self.device)  # also where the current folder changes
         pipeline.opened(self.out)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To another process goes where it is, and not what is in memory."""
+        return TrainedRun, (self.out, self.device)
 
     def __enter__(self) -> TrainedRun:
         return self
@@ -98,14 +104,21 @@ class TrainedRun:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """All that has been measured, as metrics.json has it."""
-        path = self._loaded[0].run.metrics
+        """All that has been measured, as metrics.json has it; empty where nothing was."""
+        path = pipeline.opened(self.out).metrics
         return read_json(path, dict[str, Any]) if path.exists() else {}
+
+    @property
+    def steps(self) -> list[dict[str, Any]]:
+        """The optimisation steps so far, as events.jsonl has them: `index`, `losses` by their names, `points`, `time`
+        (seconds since 1970) and so on; also of a run that is not finished.
+        """
+        return [line for line in journal.read(self.out / journal.JOURNAL_FILE) if line["event"] == "StepDone"]
 
     @property
     def splats(self) -> SplatTable:
         """The splats, frame of the input: `means` (N, 3), `opacities` (N,), `scales` (N, 2 or 3), `quats` (N, 4) w x y
-        z, `sh0` (N, 3), `sh_rest` (N, K - 1, 3); float32.
+        z, `sh0` (N, 3), `sh_rest` (N, K - 1, 3); float32, positions float64.
 
         Raises:
             BadInput: Its method makes none.
@@ -125,10 +138,9 @@ class TrainedRun:
         Raises:
             BadInput: Nothing can be drawn of what its method makes.
         """
-        ctx, made = self._loaded
+        view, (ctx, made) = view_of(camera, "render"), self._loaded
         refuse_not_drawn(ctx.run)
         assert made.draw is not None, "what is drawn has a way to draw"
-        view = camera if isinstance(camera, View) else View("camera", camera, Path("camera"))
         with torch.no_grad():
             return made.draw(view)
 
@@ -148,7 +160,7 @@ class TrainedRun:
         ctx, made = self._loaded
         run, scene = ctx.run, ctx.scene
         written = {each.name for each in fields(MeshOutput)}
-        output = MeshOutput(**{name: value for name, value in settings.items() if name in written})
+        output = settings_of(MeshOutput, {name: it for name, it in settings.items() if name in written}, "mesh")
         own = {name: value for name, value in settings.items() if name not in written}
         if mesher is not None or own:
             refuse_mesher(run.out)
@@ -167,17 +179,17 @@ class TrainedRun:
             locked(run.out),
             full_disk_in_one_line(run.out),
             maps as with_maps,
-            record_events(run.out),
+            journal.record_events(run.out),
         ):
             what = mesh_input(with_maps, made, scene, ctx.rasterizer, budget, chosen)
             record = make_mesh(with_maps, maker, output, what, made.last_steps)
         return RunMesh.read(run.out / record["files"][0])
 
-    def evaluate(self, gt: str | Path | None = None, **settings: Any) -> Figures:
+    def evaluate(self, gt: Surface | None = None, **settings: Any) -> Figures:
         """Measure: on the held-out photographs, or the run's mesh against the truth.
 
         Args:
-            gt: Point cloud, mesh or raster of heights that is the truth.
+            gt: The truth: a file (point cloud, mesh, raster of heights), (P, 3) points, or a mesh.
             settings: With `gt`: of the comparison, `tau=0.5`, `crop="none"`, `area="site.gpkg"`; see
                 `Comparison`.
 
@@ -196,16 +208,12 @@ class TrainedRun:
                 refuse_not_drawn(run)
                 found = evaluate(run, made, ctx.scene)
                 return Figures({name: value for name, value in found.items() if name not in ("geometry", "mesh")})
-            known = [each.name for each in fields(Comparison)]
-            for name in settings:
-                if name not in known:
-                    raise BadInput(f"evaluate: {unknown('setting', name, known)}")
+            comparison = settings_of(Comparison, settings, "evaluate")
             if not (run.mesh.exists() and run.mesh_record.exists()):
                 raise BadInput(f"{run.out}: no {run.mesh.name} of its model in it; mesh() makes it")
             folder = run.out / "geometry"
-            found = measure_geometry(
-                (run.mesh, Path(gt)), Comparison(**settings), folder, ctx.scene.train, ctx.scene.frame
-            )
+            truth = surface_file(gt, folder, "truth")
+            found = measure_geometry((run.mesh, truth), comparison, folder, ctx.scene.train, ctx.scene.frame)
             note_metrics(run.metrics, found)
             return Figures(found)
 

@@ -57,7 +57,7 @@ def load(hint: Any, data: Any, at: str = "") -> Any:
     if kind is Literal:
         if any(data == arg and type(data) is type(arg) for arg in args):
             return data
-        raise _unfit(at, " or ".join(map(repr, args)), data)
+        raise unfit(at, " or ".join(map(repr, args)), data)
     if kind is tuple:
         return _load_tuple(args, data, at)
     if kind is dict:
@@ -155,7 +155,7 @@ def _load_tuple(args: tuple[Any, ...], data: Any, at: str) -> tuple[Any, ...]:
     _require(list, data, at)
     hints = args[:1] * len(data) if args[1:] == (...,) else args
     if len(hints) != len(data):
-        raise BadInput(f"{_place(at)}expected a list of {len(hints)}, got {len(data)} elements")
+        raise BadInput(f"{place(at)}expected a list of {len(hints)}, got {len(data)} elements")
     return tuple(load(hint, item, _join(at, i)) for i, (hint, item) in enumerate(zip(hints, data, strict=True)))
 
 
@@ -166,12 +166,12 @@ def _load_component(base: type[Component], data: Any, at: str) -> Any:
     if not isinstance(name, str):
         came = "without" if name is None else f"with {name!r} as"
         raise BadInput(
-            f'{_place(at)}a {base.__name__} {came} its name; add "use": one of {", ".join(components(base)) or "none"}'
+            f'{place(at)}a {base.__name__} {came} its name; add "use": one of {", ".join(components(base)) or "none"}'
         )
     try:
         cls = find(base, name)
     except BadInput as error:
-        raise BadInput(f"{_place(at)}{error}") from error
+        raise BadInput(f"{place(at)}{error}") from error
     return _load_dataclass(cls, rest, at)
 
 
@@ -187,13 +187,13 @@ def _load_dataclass(cls: type, data: Any, at: str) -> Any:
         )
     needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     if missing := [name for name in needed if name not in data]:
-        raise BadInput(f"{_place(at)}{', '.join(missing)} missing; {cls.__name__} needs {', '.join(needed)}")
+        raise BadInput(f"{place(at)}{', '.join(missing)} missing; {cls.__name__} needs {', '.join(needed)}")
     hints = hints_of(cls)
     values = {key: load(hints[key], item, _join(at, key)) for key, item in data.items()}
     try:
         return cls(**values)
     except ValueError as error:
-        raise BadInput(f"{_place(at)}{error}") from error
+        raise BadInput(f"{place(at)}{error}") from error
 
 
 def _load_scalar(hint: Any, data: Any, at: str) -> Any:
@@ -202,34 +202,35 @@ def _load_scalar(hint: Any, data: Any, at: str) -> Any:
     if hint is type(None):
         if data is None:
             return None
-        raise _unfit(at, "null", data)
+        raise unfit(at, "null", data)
     if hint is float:
         if isinstance(data, float) or (isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**1023):
             return float(data)
         if isinstance(data, str) and data in _NON_FINITE:
             return float(data)
-        raise _unfit(at, "a number", data)
+        raise unfit(at, "a number", data)
     if hint is Path:
         return Path(_require(str, data, at))
     if hint is int:
         if isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**63:
             return data
-        raise _unfit(at, "a whole number", data)
+        raise unfit(at, "a whole number", data)
     if hint in (str, bool):
         return _require(hint, data, at)
-    raise TypeError(f"{_place(at)}settings of type {hint} cannot be loaded from JSON")
+    raise TypeError(f"{place(at)}settings of type {hint} cannot be loaded from JSON")
 
 
 def _require(kind: type, data: Any, at: str) -> Any:
     """`data` if it is of a JSON kind; tuples pass for lists."""
     if isinstance(data, (list, tuple) if kind is list else kind):
         return data
-    raise _unfit(at, _JSON_NAMES[kind], data)
+    raise unfit(at, _JSON_NAMES[kind], data)
 
 
-def _unfit(at: str, wanted: str, data: Any) -> BadInput:
+def unfit(at: str, wanted: str, data: Any) -> BadInput:
+    """The error of a value that is not what is wanted at a place."""
     shown = json.dumps(data, default=repr)
-    return BadInput(f"{_place(at)}expected {wanted}, got {shown if len(shown) <= 60 else shown[:57] + '...'}")
+    return BadInput(f"{place(at)}expected {wanted}, got {shown if len(shown) <= 60 else shown[:57] + '...'}")
 
 
 def _items(data: Any) -> Any:
@@ -246,7 +247,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _place(at: str) -> str:
+def place(at: str) -> str:
+    """How a message begins that is about a dotted path; "" for none."""
     return f"{at}: " if at else ""
 
 

@@ -23,7 +23,7 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.hints import hints_of
-from surfkit.core.hooks import HOOKS, Hooks, LazyCommand
+from surfkit.core.hooks import HOOKS, Hooks, LazyCommand, hookimpl
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
@@ -41,6 +41,8 @@ class Component(ABC):  # noqa: B024 (the methods are those of each kind)
 C = TypeVar("C", bound=Component)
 
 
+PLAIN = (bool, int, float, str, tuple, list, dict)
+"""What settings are, beside parts."""
 HOOK_VALUES = {
     "surfkit_recipes": "a surfkit.Recipe",
     "surfkit_tables": "a surfkit.Table",
@@ -111,6 +113,44 @@ def reload() -> None:
     _loaded.cache_clear()
 
 
+class _OwnParts:
+    """The parts of a script or a notebook."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, type[Component]] = {}
+
+    @hookimpl
+    def surfkit_components(self) -> Mapping[str, type[Component]]:
+        """What `offer` was given."""
+        return self.parts
+
+
+OWN_PARTS = "this script"
+"""The name of the plugin that has the parts of a script."""
+
+
+def offer(name: str, cls: type[Component]) -> None:
+    """Offer a part of a script or a notebook in this process, as a plugin offers its own; given again, it replaces the
+    one before.
+
+    Args:
+        name: For recipes, such as "my-loss".
+        cls: A frozen dataclass that extends the base class of its kind.
+
+    Raises:
+        BadInput: It is no such class, or another package offers one of its kind under this name.
+    """
+    _check_offer("surfkit_components", name, cls)
+    for owner, known, other in offered("surfkit_components"):
+        if known == name and owner != OWN_PARTS and issubclass(other, kind_of(cls)):
+            raise BadInput(f"offer: {class_path(other)} ({owner}) is named {name!r} already; choose another name")
+    own = plugins().get_plugin(OWN_PARTS)
+    if own is None:
+        own = _OwnParts()
+        plugins().register(own, OWN_PARTS)
+    own.parts[name] = cls
+
+
 def components(base: type[C]) -> dict[str, type[C]]:
     """Every offered subclass of `base`, by name."""
     found: dict[str, tuple[str, type[C]]] = {}
@@ -119,9 +159,10 @@ def components(base: type[C]) -> dict[str, type[C]]:
             continue
         if name in found:
             other, first = found[name]
+            two = f"{class_path(first)} ({other}) and {class_path(cls)} ({owner})"
             raise BadInput(
-                f"two packages offer a {base.__name__} named {name!r}: {_where(first)} ({other}) and {_where(cls)} "
-                f"({owner}); uninstall one, or leave it out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
+                f"two packages offer a {base.__name__} named {name!r}: {two}; uninstall one, or leave it out with "
+                "SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
             )
         found[name] = (owner, cls)
     return {name: cls for name, (_, cls) in sorted(found.items())}
@@ -191,7 +232,10 @@ def name_of(part: Component) -> str:
     for _, name, cls in offered("surfkit_components"):
         if type(part) is cls:
             return name
-    raise BadInput(f"no plugin in use offers {_where(type(part))}; return it from a surfkit_components hook")
+    raise BadInput(
+        f"no plugin in use offers {class_path(type(part))}; return it from a surfkit_components hook, or in a script "
+        f"call surfkit.offer(NAME, {type(part).__name__})"
+    )
 
 
 def kind_of(cls: type[Component]) -> type[Component]:
@@ -292,7 +336,7 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
                 f"{name!r} is {repr(value)[:80]}, and neither a dataclass with a method run() nor a surfkit.LazyCommand"
             )
         if not (value.__doc__ or "").strip() or (value.__doc__ or "").startswith(f"{value.__name__}("):
-            raise BadInput(f"{_where(value)} has no docstring; its first line is what `surfkit --help` shows")
+            raise BadInput(f"{class_path(value)} has no docstring; its first line is what `surfkit --help` shows")
     if hook != "surfkit_components":
         return
     if not (isinstance(value, type) and issubclass(value, Component)):
@@ -303,19 +347,30 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
 @cache  # all offers are checked again at each look-up, thousands of times in a table of runs
 def _check_class(name: str, cls: type[Component]) -> None:
     if "__dataclass_params__" not in vars(cls) or not vars(cls)["__dataclass_params__"].frozen:
-        raise BadInput(f"{_where(cls)} must be a frozen dataclass to be offered as {name!r}")
+        raise BadInput(f"{class_path(cls)} must be a frozen dataclass to be offered as {name!r}")
     settings = fields(cls)  # type: ignore[arg-type]  # a dataclass, as was just looked at
     if any(field.name == "use" for field in settings):
-        raise BadInput(f"{_where(cls)} has a setting named 'use', which saved recipes keep for the component's name")
+        raise BadInput(
+            f"{class_path(cls)} has a setting named 'use', which saved recipes keep for the component's name"
+        )
+    typed = {name for base in cls.__mro__ for name in vars(base).get("__annotations__", {})}
+    for attribute, value in vars(cls).items():
+        if not attribute.startswith("_") and isinstance(value, PLAIN) and attribute not in typed:
+            raise BadInput(
+                f"{class_path(cls)}: {attribute} = {value!r} has no type, so it is no setting and is not saved; write "
+                f"{attribute}: {type(value).__name__} = {value!r}, or ClassVar[{type(value).__name__}] where it is none"
+            )
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
-        raise BadInput(f"{_where(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
+        raise BadInput(f"{class_path(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
     unset = [f.name for f in settings if f.init and f.default is MISSING and f.default_factory is MISSING]
     if unset:
-        raise BadInput(f"{_where(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part")
+        raise BadInput(
+            f"{class_path(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part"
+        )
     try:
         hints_of(cls)
     except Exception as error:  # a name that is not imported, or whatever else stands for a type
-        raise BadInput(f"{_where(cls)}: a type of its settings cannot be found: {_one_line(error)}") from error
+        raise BadInput(f"{class_path(cls)}: a type of its settings cannot be found: {_one_line(error)}") from error
 
 
 def _unused(name: str, records: Mapping[str, Plugin]) -> str:
@@ -328,5 +383,6 @@ def _one_line(error: BaseException) -> str:
     return text if isinstance(error, BadInput) else f"{type(error).__name__}: {text}"
 
 
-def _where(cls: type) -> str:
+def class_path(cls: type) -> str:
+    """A class as messages name it: its module and its name."""
     return f"{cls.__module__}.{cls.__qualname__}"

@@ -7,6 +7,8 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
+from surfkit.core.fit import fit
+from surfkit.core.hints import hints_of
 
 T = TypeVar("T")
 
@@ -16,8 +18,12 @@ def evolve(node: T, path: str, value: Any) -> T:
 
     Args:
         node: Nested frozen dataclasses, dicts and tuples.
-        path: Field names, dict keys and tuple positions: "tune.prune.0.ratio". A dict may gain a new last key.
-        value: What to put there.
+        path: Field names, dict keys and tuple positions: "tune.prune.0.ratio". A dict may gain a new last key, and a
+            tuple a new last position.
+        value: What to put there; a part may be given by its name, "trim".
+
+    Raises:
+        BadInput: No such place, or the value is not allowed there.
     """
     return _evolve(node, path.split("."), 0, value)
 
@@ -50,18 +56,22 @@ def _evolve(node: Any, path: list[str], depth: int, value: Any) -> Any:
             raise BadInput(f"{here} has no {name!r}; it has {', '.join(node) or 'nothing'}")
         return node | {name: value if last else _evolve(node[name], path, depth + 1, value)}
     if isinstance(node, tuple):
-        if not (name.isdecimal() and int(name) < len(node)):
+        if not (name.isdecimal() and int(name) < len(node) + last):
             raise BadInput(f"{here} has no position {name!r}; {_positions(node)}")
         at = int(name)
+        if at == len(node):
+            return (*node, value)
         return (*node[:at], _evolve(node[at], path, depth + 1, value), *node[at + 1 :])
     if not is_dataclass(node):
         raise BadInput(f"{here} is {node!r}, which has no {name!r} inside; set {here} itself")
     names = [field.name for field in fields(node) if field.init]
     if name not in names:
         raise BadInput(f"{here} has no {name!r}; it has {', '.join(names) or 'no settings'}")
-    changed = {name: _evolve(getattr(node, name), path, depth + 1, value)}
+    changed = _evolve(getattr(node, name), path, depth + 1, value)
+    owner: type = type(node)
+    changed = fit(hints_of(owner)[name], changed, ".".join(path[: depth + 1]))
     try:
-        return replace(node, **changed)  # type: ignore[type-var]  # is_dataclass is true of classes too
+        return replace(node, **{name: changed})  # type: ignore[type-var]  # is_dataclass is true of classes too
     except ValueError as error:
         raise BadInput(f"{'.'.join(path)}: {error}") from error
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, expect
 from surfkit.core.registry import Component
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.raster.api import Maps, Rasterizer, Splats
@@ -161,6 +161,25 @@ def require_plain(value: Any, at: str, levels: int = MAX_NESTING) -> None:
         if isinstance(value, dict) and not isinstance(key, str):
             raise BadInput(f"{at} has the key {key!r} ({type(key).__name__}), which is not text")
         require_plain(item, f"{at}.{key}", levels - 1)
+
+
+def require_triangles(mesh: Any) -> None:
+    """BadInput unless it is a mesh with finite vertices, and faces that are rows of these."""
+    if not isinstance(mesh, Mesh):
+        raise BadInput(f"expected a surfkit.Mesh, got {type(mesh).__name__}")
+    for name, array, kind in (("vertices", mesh.vertices, np.floating), ("faces", mesh.faces, np.integer)):
+        if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, kind):
+            came = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
+            raise BadInput(
+                f"{name}: expected a numpy array of {'int32' if kind is np.integer else 'float32'}, got {came}"
+            )
+        expect(name, array, (len(array), 3))
+    if not np.isfinite(mesh.vertices).all():
+        row = int((~np.isfinite(mesh.vertices)).nonzero()[0][0])
+        raise BadInput(f"vertices: {mesh.vertices[row].tolist()} in row {row}; all of them must be finite")
+    if mesh.faces.size and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        came = f"{mesh.faces.min()} to {mesh.faces.max()}"
+        raise BadInput(f"faces: expected rows of {len(mesh.vertices)} vertices, got {came}")
 
 
 def require_values(mesh: Mesh) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.registry import class_path
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns, Points
 from surfkit.scene.scene import View
@@ -149,7 +150,7 @@ def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
     """What a policy asks for, or BadInput if it is no edit of so many points: other masks would pass for indices."""
     if edit is None:
         return None
-    name = f"{type(policy).__module__}.{type(policy).__qualname__}.edit"
+    name = f"{class_path(type(policy))}.edit"
     if not isinstance(edit, Edit):
         raise BadInput(f"{name} gives {type(edit).__name__}; it must be a surfkit.Edit, or None")
     for field, (kinds, shape) in ROW_FIELDS.items():

@@ -19,7 +19,7 @@ from surfkit.core.registry import name_of
 from surfkit.evaluate.images.comparison_pictures import write_picture
 from surfkit.io.datasets.depth_prior import read_priors
 from surfkit.io.datasets.masks import mask_cache
-from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_values
+from surfkit.mesh.base import LENGTHS, Mesh, Mesher, MeshInput, require_plain, require_triangles, require_values
 from surfkit.mesh.clean import CleaningReport, clean
 from surfkit.mesh.closed import UNCHANGED, bodies_of, closed, require_closed
 from surfkit.mesh.fusion import forget_spooled
@@ -161,10 +161,12 @@ def maker_of(run: Run, mesher: Mesher | Mesh) -> str:
 
 
 def plain_facts(maker: str, mesh: Mesh) -> dict[str, Any]:
-    """The facts that come with a mesh; BadInput, which names what made it, if these or its values cannot be written."""
-    facts = {} if mesh.facts is None else mesh.facts
-    facts = dict(facts) if isinstance(facts, Mapping) else facts
+    """The facts that come with a mesh; BadInput, which names what made it, if it is no mesh, or these or its
+    values cannot be written."""
     try:
+        require_triangles(mesh)
+        facts = {} if mesh.facts is None else mesh.facts
+        facts = dict(facts) if isinstance(facts, Mapping) else facts
         if not isinstance(facts, dict):
             raise BadInput(f"facts is a {type(facts).__name__}, not a dict")
         require_plain(facts, "facts")

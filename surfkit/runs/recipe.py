@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Literal
+from numbers import Real
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -207,10 +208,10 @@ def _refuse_weights(path: str, stage: Stage) -> None:
     terms |= {f"regularizers.{key}": term for key, term in stage.regularizers.items()}
     for key, term in terms.items():
         for index in (1, stage.steps):
-            if not 0 <= (weight := term.weight_at(index, stage.steps)) < math.inf:
-                raise BadInput(
-                    f"{path}.{key}: its weight in step {index} is {weight:g}; it must be 0 or more, and finite"
-                )
+            weight: Any = term.weight_at(index, stage.steps)
+            if not (isinstance(weight, Real) and 0 <= float(weight) < math.inf):
+                shown = f"{weight:g}" if isinstance(weight, Real) else repr(weight)
+                raise BadInput(f"{path}.{key}: its weight in step {index} is {shown}; it must be 0 or more, and finite")
 
 
 def _refuse_no_loss(path: str, stage: Stage) -> None:

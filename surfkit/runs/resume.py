@@ -23,6 +23,7 @@ from surfkit.io.datasets.depth_map_index import is_there, located, read_made
 from surfkit.io.datasets.depth_prior import prior_files
 from surfkit.io.datasets.fingerprint import Fingerprint, changed, changed_file, fingerprint
 from surfkit.io.datasets.read import read
+from surfkit.runs import journal
 from surfkit.runs.folder import Run, read_data, read_record
 from surfkit.runs.recipe import Recipe
 from surfkit.runs.run_notes import RunNotes
@@ -35,7 +36,8 @@ SAME_PLACE = 1e-6
 
 
 def refuse_other_run(run: Run) -> None:
-    """BadInput if the folder holds a run that this one does not continue; a warning if this one makes it longer."""
+    """BadInput if the folder holds a run that this one does not continue; a warning if this one makes it longer, or
+    shorter than it was to be."""
     there = read_recipe_before(run.out / "recipe.json", run.recipe)
     now = dump(run.recipe)
     before_about = there.get("about") if isinstance(there, dict) else None
@@ -50,7 +52,8 @@ def refuse_other_run(run: Run) -> None:
     if found and not (found := difference_but_length(run, there)):
         emit(
             Warned(
-                f"the run is made longer, from {there['pretrain']['steps']} steps to {run.recipe.pretrain.steps}: "
+                f"the run is made {'longer' if run.recipe.pretrain.steps > there['pretrain']['steps'] else 'shorter'}, "
+                f"from {there['pretrain']['steps']} steps to {run.recipe.pretrain.steps}: "
                 "steps still to come follow the schedules of the new length, those already made followed the old ones, "
                 "so the result is not that of a run of this length from the start"
             )
@@ -92,21 +95,32 @@ def read_recipe_before(path: Path, now: Recipe) -> Any:
 
 
 def difference_but_length(run: Run, there: Any) -> tuple[str, Any, Any] | None:
-    """The first difference beside the length between a recipe and a shorter one in the folder; None if there is none.
+    """The first difference beside the length between a recipe and one in the folder; None if there is none.
 
-    The recipe may be longer with all schedules scaled (`--steps`), or with none scaled (`--pretrain.steps`).
+    The recipe may be longer, or as short as the steps that are made allow, with all schedules scaled (`--steps`), or
+    with none scaled (`--pretrain.steps`).
     """
     plain = first_difference(there, dump(run.recipe))
     now = run.recipe.pretrain.steps
     stage = there.get("pretrain") if isinstance(there, dict) else None
     before = stage.get("steps") if isinstance(stage, dict) else None
-    if not isinstance(before, int) or not 0 < before < now:
+    if not isinstance(before, int) or not 0 < before != now or (now < before and steps_made(run) > now):
         return plain
     old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
     if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
         return None
-    scaled = rescale_like(old, now / before, run.recipe)
-    return first_difference(dump(replace(scaled, lod=run.recipe.lod)), dump(run.recipe))  # these are as they are now
+    short, long = (
+        (old, run.recipe) if before < now else (run.recipe, old)
+    )  # counts of the longer one are the finer ones
+    scaled = replace(rescale_like(short, max(now, before) / min(now, before), long), lod=long.lod)  # which may differ
+    pair = (scaled, long) if before < now else (long, scaled)
+    return first_difference(*map(dump, pair))
+
+
+def steps_made(run: Run) -> int:
+    """Steps of the first stage that the journal has; the last checkpoint has no more."""
+    lines = journal.read(run.out / journal.JOURNAL_FILE)
+    return max((line.get("index", 0) for line in lines if line["event"] == "StepDone"), default=0)
 
 
 def first_difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, emit, say
 from surfkit.core.hooks import hookimpl
@@ -79,9 +80,19 @@ def higher(known: Mapping[str, int], found: Mapping[str, int]) -> dict[str, int]
 
 @contextmanager
 def collect_notes() -> Iterator[RunNotes]:
-    """Within, warnings are printed and collected."""
+    """Within, warnings are printed and collected.
+
+    Raises:
+        BadInput: This process collects those of other work already: who listens could not tell the two apart.
+    """
     notes = RunNotes()
-    plugins().register(notes, NOTES)
+    try:
+        plugins().register(notes, NOTES)
+    except ValueError as error:
+        raise BadInput(
+            "surfkit: this process is still at other work on a data set or a run, in another thread or around this "
+            "call; begin when that has ended, or in another process"
+        ) from error
     try:
         yield notes
     finally:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
@@ -43,6 +44,11 @@ def difference(first: Any, second: Any) -> str | None:
         if path not in one or path not in two or not _equal(one[path], two[path]):
             return path.lstrip(".")
     return None
+
+
+def assert_tensor(what: str, value: object) -> None:
+    """AssertionError if what somebody gave is no tensor."""
+    assert isinstance(value, Tensor), f"{what} gives {type(value).__name__}, not a tensor"
 
 
 def assert_same(what: str, first: Any, second: Any, remedy: str) -> None:

@@ -24,7 +24,7 @@ from surfkit.losses.transients import Transients
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
-from surfkit.testing.equality import assert_same, twin, unchanged
+from surfkit.testing.equality import assert_same, assert_tensor, twin, unchanged
 from surfkit.testing.inputs import cloud, depth_input, maps, splats, target
 from surfkit.testing.synthetic import Synthetic
 
@@ -57,6 +57,7 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
         leaves = {key: value.requires_grad_() for key, value in drawn.present().items()}
         with unchanged(name, maps=drawn, target=about):
             value = loss(drawn, about)
+        assert_tensor(name, value)
         assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
         assert torch.isfinite(value), f"{name}{what} is {value.item()}"
         assert torch.equal(value, loss(drawn, about)), f"{name} is not repeatable; draw from `target.seed`"
@@ -105,6 +106,7 @@ def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Ten
         _check_with_maps(f"{name}.with_maps", regularizer, given, replace(step, stat=_stats(kept, len(given))))
         with unchanged(f"{name}.in_step", splats=given, target=about, maps=drawn, seen=seen):
             value = regularizer.in_step(given, step)
+        assert_tensor(name, value)
         assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
         assert torch.isfinite(value), f"{name} is {value.item()}"
         resumed = twin(regularizer).in_step(given, replace(step, stat=_stats(kept, len(given))))
@@ -187,6 +189,7 @@ def check_appearance(appearance: Appearance) -> None:
     assert any(rates) or appearance.needs_light, f"{name}: the learning rate is 0 throughout, so nothing is learned"
     numbers, color = appearance.begin(5), torch.rand(3, 12, 16, generator=draw)
     camera = Camera(torch.eye(4, dtype=torch.float64), 15.0, 15.0, 8.0, 6.0, 16, 12)
+    assert_tensor(f"{name}.begin", numbers)
     assert len(numbers) == 5, f"{name}.begin(5) has {len(numbers)} rows"
     assert torch.isfinite(numbers).all(), f"{name}.begin is not finite"
     assert_same(f"{name}.begin", numbers, appearance.begin(5), DETERMINISM_HINT)
@@ -198,7 +201,10 @@ def check_appearance(appearance: Appearance) -> None:
         none = PhotoLight(torch.zeros(5, STOPS), torch.zeros(5, OF_CAMERA))
         assert_same(f"{name}.begin_with, of light that did not change,", numbers, appearance.begin_with(none), "")
     for at, row in enumerate(numbers):
-        same = torch.allclose(appearance(joined(row, shared), color, camera), color, atol=1e-5)
+        shown = appearance(joined(row, shared), color, camera)
+        assert_tensor(name, shown)
+        assert shown.shape == color.shape, f"{name} gives shape {tuple(shown.shape)}, not {tuple(color.shape)}"
+        same = torch.allclose(shown, color, atol=1e-5)
         assert same, f"{name}: the numbers that photograph {at} begins with change its colours"
     moved, common = (
         (value + 0.1 * torch.randn(value.shape, generator=draw)).requires_grad_() for value in (numbers[0], shared)
@@ -207,6 +213,7 @@ def check_appearance(appearance: Appearance) -> None:
         shown = appearance(joined(moved, common), color.requires_grad_(), camera)
     assert shown.shape == color.shape, f"{name} gives colours of shape {tuple(shown.shape)}, not {tuple(color.shape)}"
     assert torch.isfinite(shown).all(), f"{name} gives colours that are not finite"
+    assert shown.requires_grad, f"{name} gives no gradient: what it returns has no graph"
     leaves = {"colours": color} | ({"numbers": moved} if any(rates) else {})
     leaves |= {"shared numbers": common} if len(shared) else {}
     for what, leaf in leaves.items():
@@ -216,6 +223,7 @@ def check_appearance(appearance: Appearance) -> None:
     params = Surfel2D(sh_degree=1).init(cloud(), torch.Generator().manual_seed(0))
     with unchanged(f"{name}.folded", numbers=numbers, params=params):
         folded = appearance.folded(numbers, params)
+    assert isinstance(folded, Mapping), f"{name}.folded gives {type(folded).__name__}, not columns by name"
     shapes = [{key: tuple(value.shape) for key, value in columns.items()} for columns in (params, folded)]
     assert shapes[0] == shapes[1], f"{name}.folded gives columns of shapes {shapes[1]}, not {shapes[0]}"
     for key, value in folded.items():

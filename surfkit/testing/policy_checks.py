@@ -15,7 +15,7 @@ from torch import Tensor
 from surfkit.densify.base import Densify, Filter, Policy, Prune, Signal, Step
 from surfkit.primitives.edit import Edit, NewPoints
 from surfkit.primitives.points import Points
-from surfkit.testing.equality import assert_same, twin, unchanged
+from surfkit.testing.equality import assert_same, assert_tensor, twin, unchanged
 from surfkit.testing.inputs import crowd, splats
 
 STAGE_STEPS = 30_000
@@ -118,6 +118,7 @@ def check_signal(signal: Signal) -> None:
     ):
         with unchanged(f"{name}.combine", chosen=a, total=b):
             found = signal.combine(a, b)
+        assert_tensor(f"{name}.combine{what}", found)
         assert found.shape == (60, 2), f"{name}.combine{what} has shape {tuple(found.shape)}, not (60, 2)"
         assert torch.isfinite(found).all(), f"{name}.combine{what} is not finite"
         assert not (found * (1 - seen)).any(), f"{name}.combine{what} is not 0 for points that are not seen"
@@ -214,6 +215,7 @@ def _check_new(what: str, new: NewPoints | None, points: Points) -> None:
 
 
 def _check_rows(what: str, value: Tensor, field: str, count: int) -> None:
+    assert_tensor(what, value)
     if field in ("drop", "clone", "split", "forget", "scatter"):
         counts = field == "clone"
         allowed = (torch.bool, torch.int64) if counts else (torch.bool,)

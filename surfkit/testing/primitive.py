@@ -34,6 +34,7 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
     for degree in range(primitive.sh_degree + 1):
         with unchanged(f"{name}.activate", params=params):
             splats = primitive.activate(params, degree)
+        assert isinstance(splats, Splats), f"{name}.activate gives {type(splats).__name__}, not surfkit.plugin.Splats"
         _check_splats(f"{name}.activate", splats, degree)
     assert torch.allclose(primitive.activate(params, 0).means, given.xyz, atol=1e-5), f"{name}: points begin elsewhere"
     _check_dependent(name, primitive, params)

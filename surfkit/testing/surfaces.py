@@ -38,6 +38,7 @@ def check_mesher(mesher: Mesher, subject: MeshInput | None = None) -> None:
         subject = replace(subject, priors=None)
     with unchanged(f"{name}.mesh", splats=subject.splats, views=subject.views, priors=subject.priors):
         mesh = mesher.mesh(replace(subject, generator=torch.Generator().manual_seed(1)))
+    assert isinstance(mesh, Mesh), f"{name}.mesh gives {type(mesh).__name__}, not a surfkit.Mesh"
     _check_whole(name, mesh)
     again = mesher.mesh(replace(subject, generator=torch.Generator().manual_seed(1)))
     sides, centres = _sides(mesh), torch.stack([view.camera.centre for view in subject.views]).numpy()

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from surfkit.appearance.base import Appearance, PhotoLight, joined
+from surfkit.core.check import BadInput, expect
+from surfkit.core.registry import class_path
 from surfkit.primitives.points import Columns
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
@@ -23,6 +25,10 @@ def first_appearances(model: Appearance, count: int, light: PhotoLight | None) -
     if light is None and model.needs_light:
         return {}
     value, shared = model.begin(count) if light is None else model.begin_with(light), model.begin_shared()
+    if not isinstance(value, Tensor) or len(value) != count:
+        came = f"{len(value)} rows" if isinstance(value, Tensor) else type(value).__name__
+        name = f"{class_path(type(model))}.begin"
+        raise BadInput(f"{name}: expected a tensor of {count} rows, one for each photograph, got {came}")
     table = {"value": value, "first": torch.zeros_like(value), "second": torch.zeros_like(value)}
     if len(shared):
         moments = {f"shared_{name}": torch.zeros_like(shared) for name in ("first", "second")}
@@ -68,7 +74,9 @@ class ImageAppearance:
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
         own, *shared = (leaf.to(color) for leaf in self.leaves)
-        return self.model(joined(own, *shared) if shared else own, color, self.camera)
+        found = self.model(joined(own, *shared) if shared else own, color, self.camera)
+        expect(f"{class_path(type(self.model))}", found, tuple(color.shape))
+        return found
 
     def add(self, grads: Sequence[Tensor | None]) -> None:
         """Add gradients of some of the losses by `leaves`: of the photograph's numbers, (...), and the shared (S,)."""

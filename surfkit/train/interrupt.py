@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +20,35 @@ class StopRequest:
     asked: bool = False
 
 
+_HERE: ContextVar[StopRequest | None] = ContextVar("here", default=None)
+"""Of the work of this thread that stops between two steps."""
+
+
+def ask_to_stop() -> bool:
+    """Ask the work of this thread to stop after its step, as Ctrl-C does; False where there is none that can."""
+    request = _HERE.get()
+    if request is not None:
+        request.asked = True
+    return request is not None
+
+
 @contextmanager
 def graceful() -> Iterator[StopRequest]:
-    """Within, the first SIGINT, SIGTERM or SIGHUP only sets `asked`; a second one acts as ever, but for SIGHUP, which
-    comes several times when a terminal is closed."""
+    """Within, `ask_to_stop` and the first SIGINT, SIGTERM or SIGHUP only set `asked`; a second signal acts as ever, but
+    for SIGHUP, which comes several times when a terminal is closed."""
     request = StopRequest()
+    token = _HERE.set(request)
+    try:
+        with _signals_heard(request):
+            yield request
+    finally:
+        _HERE.reset(token)
+
+
+@contextmanager
+def _signals_heard(request: StopRequest) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield request
+        yield
         return
     previous: dict[int, Any] = {number: signal.getsignal(number) for number in asking()}
 
@@ -37,7 +60,7 @@ def graceful() -> Iterator[StopRequest]:
     for number in previous:
         signal.signal(number, ask)
     try:
-        yield request
+        yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

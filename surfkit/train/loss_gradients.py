@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from surfkit.core.check import expect
 from surfkit.densify.base import Signal
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.primitives.points import Columns
@@ -82,7 +83,7 @@ def loss_gradients(
     if appearance is not None and appearance.model.spares_structure:
         plain = ignoring(leafy, target)  # hidden pixels of the photograph are then those of the scene as it is
     values = {
-        name: weight * losses[name](*(plain if losses[name].of_structure else changed))
+        name: weight * _one_number(name, losses[name](*(plain if losses[name].of_structure else changed)))
         for name, weight in active.items()
     }
     numbers = as_numbers(values)
@@ -93,6 +94,13 @@ def loss_gradients(
     chosen = gradient([value for name, value in values.items() if name in terms], leaves, appearance, shared)
     others = gradient([value for name, value in values.items() if name not in terms], leaves, appearance)
     return numbers, added(chosen, others), chosen
+
+
+def _one_number(name: str, value: Any) -> Tensor:
+    """What a loss gives, or BadInput that names the loss: what comes later could not tell which one it was."""
+    if not isinstance(value, Tensor) or value.numel() != 1:
+        expect(f"losses.{name}", value, ())
+    return value
 
 
 def regularizer_terms(

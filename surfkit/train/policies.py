@@ -9,7 +9,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import ComparedView, Step, ViewStatistics
+from surfkit.core.check import BadInput, expect
+from surfkit.core.registry import class_path
+from surfkit.densify.base import ComparedView, Signal, Step, ViewStatistics
 from surfkit.losses.base import ignoring
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.init import SH_C0
@@ -27,7 +29,7 @@ def told(setup: StageSetup, state: StageState, result: StepResult) -> Step:
     """What the policies are told about a step, and nothing about frozen points."""
     stage, index, gradients, in_view = setup.stage, state.index + 1, result.gradients, result.in_view
     camera, points, home = result.target.view.camera, len(state.points), state.points.device
-    combined = combined_signal(setup, gradients)
+    combined = combined_signal(setup, gradients, index == 1)
     signed_norm = lengths(gradients.signal).to(home)
     shown = ViewStatistics(
         rows=None if in_view is None else in_view.rows,
@@ -95,15 +97,26 @@ def compared_view(setup: StageSetup, state: StageState, result: StepResult) -> C
     return ComparedView(color, photo, blended)
 
 
-def combined_signal(setup: StageSetup, gradients: Gradients) -> Tensor:
-    """(N, 2) what drives densification, of the chosen losses and of all."""
+def combined_signal(setup: StageSetup, gradients: Gradients, is_first: bool) -> Tensor:
+    """(N, 2) what drives densification, of the chosen losses and of all; in the first step its values are looked at,
+    for which a GPU must be waited."""
     signal, processes, total = setup.stage.signal, setup.processes, gradients.signal
     chosen = total if gradients.chosen is None else gradients.chosen
     if processes is None or signal.terms is None:
-        return signal.combine(chosen, total)
+        return _fitting(signal, signal.combine(chosen, total), total, is_first)
     rows = own_rows(processes, len(total))
     chosen, total = torch.split(processes.gathered(torch.cat([chosen, total], 1)), 2, 1)
-    return signal.combine(chosen, total)[rows]
+    return _fitting(signal, signal.combine(chosen, total), total, is_first)[rows]
+
+
+def _fitting(signal: Signal, combined: Tensor, total: Tensor, is_first: bool) -> Tensor:
+    """(N, 2) what a signal gives; BadInput if it has another shape, or in the first step makes NaN of what is finite:
+    no point would be added, without a word."""
+    name = f"{class_path(type(signal))}.combine"
+    expect(name, combined, tuple(total.shape))
+    if is_first and not combined.sum().isfinite() and total.sum().isfinite():
+        raise BadInput(f"{name}: NaN or Inf, of gradients that are finite; give finite values")
+    return combined
 
 
 def rates_at(setup: StageSetup, state: StageState) -> dict[str, float]:

@@ -114,6 +114,16 @@ def test_a_step_may_stop_the_run(folder, tmp_path):
         (lambda scene, run: run.evaluate().f1, "f1 was not measured"),
         (lambda scene, run: run.dataset.camera((0, 0, 0), (0, 0, 1)), "give another `up`"),
         (lambda scene, run: surfkit.open(scene), "no run folder"),
+        (lambda scene, run: surfkit.read(scene, scale="4"), "read: scale: expected a number, got .4"),
+        (lambda scene, run: surfkit.read(None), "read: expected a path, got null"),
+        (lambda scene, run: surfkit.train("2dgs", scene, "x", steps=10.5), "steps: expected a whole number, got 10.5"),
+        (lambda scene, run: surfkit.train("2dgs", scene, None), "out: expected a path, got null"),
+        (lambda scene, run: run.mesh(triangles="300"), "mesh: triangles: expected a whole number, got .300"),
+        (lambda scene, run: run.mesh(voxel_px="3"), "voxel_px: expected a number"),
+        (lambda scene, run: run.evaluate(gt=run.out / "mesh.ply", tau="2"), "evaluate: tau: expected a number, got .2"),
+        (lambda scene, run: run.evaluate(gt=np.zeros((3, 2)), tau=2), r"truth: expected shape \(P, 3\), got \(3, 2\)"),
+        (lambda scene, run: run.evaluate(gt=5, tau=2), "truth: expected a path, got 5"),
+        (lambda scene, run: surfkit.compare("no.ply", "no.ply", "x", taus=3), "did you mean 'tau'"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(page, folder, wrong, said, tmp_path, monkeypatch):
@@ -153,3 +163,14 @@ def test_train_is_a_function_and_a_folder():
     from surfkit.train.stage import Stage
 
     assert callable(surfkit.train) and surfkit.train.stage.Stage is Stage
+
+
+def test_points_in_memory_against_a_mesh_of_another_program(page, folder, tmp_path):
+    mesh = RunMesh.read(folder / "RUN" / "mesh.ply")
+    settings = {"tau": 0.5, "draws": 1, "crop": "none", "align": "none"}
+    whole = surfkit.compare(mesh, folder / "RUN" / "mesh.ply", tmp_path / "whole", **settings)
+    half = mesh.vertices[mesh.vertices[:, 0] < np.median(mesh.vertices[:, 0])]
+    less = surfkit.compare(half, mesh, tmp_path / "half", **settings)
+    assert whole.f1 > 0.99 and less.precision > 0.85 and less.recall < 0.5
+    ours = surfkit.open(folder / "RUN").evaluate(gt=mesh, **settings)
+    assert ours.recall > 0.95

@@ -6,6 +6,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.describe import settings, summary
 from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component, components, failures, find, kebab, kind_of, name_of
+from surfkit.core.registry import offer as offer_own
 
 
 def offer(registry, name, **parts):
@@ -120,3 +121,38 @@ def test_description(world):
     stage = {s.name: s for s in settings(world.Stage)}
     assert stage["grow"].default == "adaptive" and stage["grow"].help == ""
     assert stage["losses"].default == "l1: l1, depth: depth"
+
+
+def test_a_part_of_a_script_is_offered_and_replaced(world, bare):
+    for given in (1.0, 2.0):  # a cell of a notebook that is run again
+
+        @dataclass(frozen=True)
+        class Mine(world.Loss):
+            weight: float = given
+
+        with pytest.raises(BadInput, match=r"in a script call surfkit.offer\(NAME, Mine\)"):
+            name_of(Mine())
+        offer_own("mine", Mine)
+        assert name_of(Mine()) == "mine" and find(world.Loss, "mine")().weight == given
+
+
+def test_a_part_of_a_script_takes_no_name_of_others(world, bare):
+    @dataclass(frozen=True)
+    class Mine(world.Loss):
+        """Mine."""
+
+    with pytest.raises(BadInput, match="L1 .* is named 'l1' already; choose another name"):
+        offer_own("l1", Mine)
+    with pytest.raises(BadInput, match="not a name in kebab-case"):
+        offer_own("My Loss", Mine)
+
+
+def test_a_setting_without_a_type_is_refused(world, bare):
+    @dataclass(frozen=True)
+    class Mine(world.Loss):
+        """Mine."""
+
+        weight = 0.5
+
+    with pytest.raises(BadInput, match=r"Mine: weight = 0.5 has no type, .* write weight: float = 0.5, or ClassVar"):
+        offer_own("mine", Mine)

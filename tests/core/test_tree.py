@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from surfkit.core.check import BadInput
@@ -36,7 +37,7 @@ def test_a_dict_may_gain_a_key(world):
         ("pretrain.stepz", "pretrain has no 'stepz'; it has steps, losses"),
         ("pretrain.losses.ssim.weight", "pretrain.losses has no 'ssim'; it has l1, depth"),
         ("pretrain.prune.0.cap", "pretrain.prune has no position '0'; it is empty"),
-        ("pretrain.marks.2", "pretrain.marks has no position '2'; its positions are 0 to 1"),
+        ("pretrain.marks.3", "pretrain.marks has no position '3'; its positions are 0 to 1"),
         ("tune.steps", "tune is None, which has no 'steps' inside; set tune itself"),
         ("pretrain.steps", "pretrain.steps: steps is 0; it must be 1 or more"),
     ],
@@ -44,4 +45,33 @@ def test_a_dict_may_gain_a_key(world):
 def test_wrong_paths_and_values(world, path, message):
     with pytest.raises(BadInput) as caught:
         evolve(world.Recipe(), path, 0)
+    assert str(caught.value).startswith(message)
+
+
+def test_a_part_may_be_given_by_its_name(world):
+    changed = evolve(world.Recipe(), "pretrain.grow", "adaptive")
+    assert changed.pretrain.grow == world.Adaptive()
+    more = evolve(changed, "pretrain.prune.0", "relocate")
+    assert more.pretrain.prune == (world.Relocate(),), "the first of an empty list, as on the command line"
+
+
+def test_numbers_of_numpy_are_saved_like_others(world):
+    changed = evolve(world.Recipe(), "pretrain.losses.l1.weight", np.float32(0.5))
+    assert load(world.Recipe, dump(evolve(changed, "pretrain.steps", np.int64(7)))).pretrain.steps == 7
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("pretrain.steps", "many", 'pretrain.steps: expected a whole number, got "many"'),
+        ("pretrain.steps", 2.5, "pretrain.steps: expected a whole number, got 2.5"),
+        ("pretrain.losses.l1.weight", "0.5", 'pretrain.losses.l1.weight: expected a number, got "0.5"'),
+        ("pretrain.losses.l1", 0.5, "pretrain.losses.l1: expected a Loss, or the name of one, got 0.5"),
+        ("pretrain.grow", "adaptiv", "pretrain.grow: no Grow named 'adaptiv'; did you mean"),
+        ("tune", "no", 'tune: expected a Stage, got "no"'),
+    ],
+)
+def test_a_value_of_another_type_is_refused(world, path, value, message):
+    with pytest.raises(BadInput) as caught:
+        evolve(world.Recipe(), path, value)
     assert str(caught.value).startswith(message)

@@ -131,6 +131,18 @@ def test_a_run_is_made_longer(finished, recipe, whole_recipe, tmp_path, monkeypa
         run(recipe, data, out)
 
 
+@pytest.mark.parametrize("length", [13, 20])
+def test_a_stopped_run_is_made_shorter(data, recipe, whole_recipe, tmp_path, monkeypatch, length):
+    out, short = tmp_path / "run", with_steps(whole_recipe, length)
+    interrupted(recipe, data, out, 13, monkeypatch)
+    with pytest.raises(BadInput, match="pretrain.steps 24, .*12"):
+        run(with_steps(whole_recipe, 12), data, out)  # 13 are made
+    metrics = run(short, data, out)
+    assert metrics["steps"] == length and load_run(out)[0].recipe == complete(short)
+    assert steps(out) == list(range(1, length + 1)) and (out / "point_cloud.ply").exists()
+    assert notes(out)[0].startswith(f"the run is made shorter, from 24 steps to {length}")
+
+
 def test_a_run_is_made_longer_under_its_old_schedule(done, recipe):
     assert run(evolve(recipe, "pretrain.steps", 30), *done)["steps"] == 30
 

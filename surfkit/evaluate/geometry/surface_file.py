@@ -131,6 +131,8 @@ def read_surface(path: Path) -> SurfaceFile:
     Raises:
         BadInput: No such file, damaged, without points, or a mesh without faces.
     """
+    if path.is_dir():
+        raise BadInput(f"{path}: a folder; name the file of a mesh or a cloud of points in it")
     if not path.is_file():
         raise BadInput(f"{path}: no such file; name a mesh or a cloud of points")
     kind = path.suffix.lower()
