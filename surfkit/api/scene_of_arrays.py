@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ CONVENTION = (
     "give world to camera with x right, y down, z forward: of a camera to world with y up and z back, "
     "np.linalg.inv(pose @ np.diag([1, -1, -1, 1]))"
 )
-MOST_CHECKED, LEAST_SEEN, WRONG_FROM = 2000, 200, 0.95
+MAX_CHECKED_POINTS, MIN_SIGHTS, WRONG_POSE_RATIO = 2000, 200, 0.95
 """Points whose colours are compared with photographs; how often they must be seen for that; see `_doubt`."""
 MAX_POSE_ERROR = 1e-3
 """How far a rotation may be from one: more is another matrix, such as one with a scale."""
@@ -64,6 +64,9 @@ def from_arrays(
     names = [f"{i:05d}.png" for i in range(count)] if names is None else list(names)
     if len(set(names)) != count:
         raise BadInput(f"from_arrays: {len(set(names))} different names for {count} images; give one for each")
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or not Path(name).suffix:
+            raise BadInput(f"from_arrays: name {name!r}; give a file name with a suffix, such as left/00000.png")
     pictures = [_picture(f"images[{i}]", image) for i, image in enumerate(images)]
     cameras = _poses(poses, count)
     lenses = _finite("intrinsics", intrinsics)
@@ -107,7 +110,7 @@ def _doubt(
 
     Right poses make their difference 0.55 to 0.85 times that of points in another order, wrong ones 0.99 or more.
     """
-    pick = np.random.default_rng(0).permutation(len(points))[:MOST_CHECKED]
+    pick = np.random.default_rng(0).permutation(len(points))[:MAX_CHECKED_POINTS]
     places, own = points[pick], colors[pick].astype(np.float64)
     off, shuffled = [], []
     for picture, pose, lens in zip(pictures, poses, lenses, strict=True):
@@ -121,9 +124,9 @@ def _doubt(
         off.append(np.abs(there - own[rows]))
         shuffled.append(np.abs(there - np.roll(own[rows], len(rows) // 2, axis=0)))
     differences = np.concatenate(off)
-    if len(differences) < LEAST_SEEN and len(points) >= LEAST_SEEN:
+    if len(differences) < MIN_SIGHTS and len(points) >= MIN_SIGHTS:
         return f"poses: hardly a camera sees any of the {len(points):,} points; {CONVENTION}"
-    if len(differences) < LEAST_SEEN or differences.mean() < WRONG_FROM * np.concatenate(shuffled).mean():
+    if len(differences) < MIN_SIGHTS or differences.mean() < WRONG_POSE_RATIO * np.concatenate(shuffled).mean():
         return None
     return f"poses: the colours of the points are not those of the photographs at their places; {CONVENTION}"
 

@@ -79,6 +79,8 @@ def test_poses_of_another_convention_are_told(files, tmp_path, capsys):
         ({"points": np.zeros((5, 2))}, r"points: expected shape \(P, 3\), got \(5, 2\)"),
         ({"colors": np.zeros((4, 3), np.uint8)}, r"colors: expected shape \(5, 3\), got \(4, 3\)"),
         ({"names": ["a.png", "b.png"]}, "2 different names for 1 images"),
+        ({"names": ["../a.png"]}, r"name '../a.png'; give a file name with a suffix"),
+        ({"names": ["a"]}, r"name 'a'; give a file name with a suffix"),
         ({"scal": 2}, "did you mean 'scale'"),
     ],
 )
