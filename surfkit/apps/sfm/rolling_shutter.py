@@ -8,6 +8,7 @@ positions of the middle rows. Photographs are corrected when they are undistorte
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -38,6 +39,8 @@ DOUBT_SIGMAS = 3.0
 """From so many standard deviations on, speeds taken for what they are, an estimate contradicts a known readout time."""
 MIN_GAIN = 0.01
 """An estimate counts that makes the mean reprojection error smaller by this share."""
+MAX_SEARCHED = 300
+"""Photographs of a lens that its readout time is estimated from: more would take long, and tell the same."""
 MIN_SPEED_M = 2.0
 """Cameras whose readout time is not known, and that are slower, m/s, are left alone: people walk."""
 
@@ -159,13 +162,16 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     if not known and (motion.speed is None or motion.speed < MIN_SPEED_M):
         slow = "no known speed" if motion.speed is None else f"a speed of {motion.speed:.1f} m/s"
         return model, RollingShutter(listed, why=f"cameras of unknown readout time have {slow}")
-    search = RowAdjustment(model, photos, settings)
+    part = searched(model, photos)
+    search = RowAdjustment(part, photos, settings)
     times = search.estimate({number: lens.ms for number, lens in lenses.items()})
     lenses = {number: _judged(lens, times[number]) for number, lens in lenses.items()}
     listed = {str(number): lens for number, lens in lenses.items()}
     chosen = {number: lens.ms / 1000 for number, lens in lenses.items() if lens.ms is not None}
     if not chosen:
         return model, RollingShutter(listed, why="the photographs show no rolling shutter")
+    if part is not model:
+        search = RowAdjustment(model, photos, settings)
     found = search.final(chosen)
     before = mean_error(load_engine().Reconstruction(model))
     after = None if found is None else mean_error(found)
@@ -177,6 +183,27 @@ def correct(model: Any, photos: Mapping[str, Photo], settings: Settings) -> tupl
     by_xmp = sum(motion.velocities[name].by_xmp for name in motions)
     speeds = f"XMP of {by_xmp} photographs, paths of {len(motions) - by_xmp}"
     return found, RollingShutter(listed, motions, "", speeds, (before, after), float(np.median(shifts)))
+
+
+def searched(model: Any, photos: Mapping[str, Photo]) -> Any:
+    """The model, or of a large one the photographs of each lens that were taken one after another in the middle of the
+    flight: strips beside one another, which show the same points in several directions."""
+    by_lens: dict[int, list[tuple[float, str, int]]] = {}
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        taken = seconds(photos[image.name].exif.taken)
+        by_lens.setdefault(image.camera_id, []).append((math.inf if taken is None else taken, image.name, number))
+    kept = set[int]()
+    for listed in by_lens.values():
+        timed = sorted(one for one in listed if one[0] < math.inf) or sorted(listed)
+        first = max(0, (len(timed) - MAX_SEARCHED) // 2)
+        kept |= {number for *_, number in timed[first : first + MAX_SEARCHED]}
+    if all(len(listed) <= MAX_SEARCHED for listed in by_lens.values()):
+        return model
+    part = load_engine().Reconstruction(model)
+    for frame in {part.image(number).frame_id for number in model.reg_image_ids() if number not in kept}:
+        part.deregister_frame(frame)
+    return part
 
 
 def refuse_timeless(photos: Sequence[Photo], settings: Settings) -> None:

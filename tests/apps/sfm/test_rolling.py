@@ -10,7 +10,7 @@ from flight import FOCAL, HEIGHT, WIDTH, Flight, reconstructed
 from listening import listening
 from PIL import Image
 
-from surfkit.apps.sfm import row_adjustment
+from surfkit.apps.sfm import rolling_shutter, row_adjustment
 from surfkit.apps.sfm.camera_motion import motion_of, seconds
 from surfkit.apps.sfm.control_list import GroundControl, GroundControlPoint
 from surfkit.apps.sfm.dataset_export import undistorted
@@ -117,6 +117,26 @@ def test_a_global_shutter_is_left_alone(tmp_path):
         "correcting it does not make the photographs agree better",
     )
     assert abs(what.lenses["1"].estimate_ms[0]) < 5
+
+
+def test_of_many_photographs_some_tell_the_readout_time_and_all_are_corrected(rolled, monkeypatch):
+    flight, photos, model = rolled
+    looked = []
+
+    class Watched(row_adjustment.RowAdjustment):
+        def __init__(self, part, *rest):
+            looked.append(sorted(part.image(number).name for number in part.reg_image_ids()))
+            super().__init__(part, *rest)
+
+    monkeypatch.setattr(rolling_shutter, "RowAdjustment", Watched)
+    monkeypatch.setattr(rolling_shutter, "MAX_SEARCHED", 14)
+    found, what = correct(model, photos, Settings())
+    some, everyone = looked
+    assert len(flight.names) > 18 and some == sorted(flight.names)[(len(flight.names) - 14) // 2 :][:14]
+    assert everyone == sorted(flight.names) == sorted(what.motions)
+    assert what.lenses["1"].estimate_ms[0] == pytest.approx(1000 * READOUT_S, rel=0.1)
+    assert found.compute_mean_reprojection_error() < model.compute_mean_reprojection_error() - 0.15
+    assert model.num_reg_images() == len(flight.names), "the model itself is whole"
 
 
 def test_adjustments_are_told_as_they_are_done(rolled, monkeypatch):
