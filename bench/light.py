@@ -10,6 +10,7 @@ Variants of a rendered survey (shibuya-synth), with seeds that never change; bes
     vignetting  half the light in the corners, after 1 - r^2 / 2
     cameras     two cameras, named in EXIF, with other response curves, take turns
     all         all of them
+    unclipped   all of them, with half the range of exposure, and so dark that no white is cut off
 
 Light is changed as in a camera: sRGB is decoded, multiplied, limited to 1, encoded, and put through the response curve.
 Each variant is trained without and with each appearance, one run after the other, on every photograph that is not held
@@ -56,6 +57,7 @@ VARIANTS = {
     "vignetting": ("vignetting",),
     "cameras": ("cameras",),
     "all": ("exposure", "vignetting", "cameras"),
+    "unclipped": ("exposure", "vignetting", "cameras", "unclipped"),
 }
 STOPS, BALANCE, CORNER = 1.5, 0.15, 0.5
 RESPONSES = {"A": 0.85, "B": 1.2}
@@ -70,6 +72,8 @@ def truth_of(names: list[str], parts: tuple[str, ...]) -> dict[str, Any]:
     for at, name in enumerate(names):
         stops, red, blue = draw.uniform(-STOPS, STOPS), *draw.uniform(1 - BALANCE, 1 + BALANCE, 2)
         gains = stops + np.log2([red, 1.0, blue])
+        if "unclipped" in parts:
+            gains = (gains - STOPS) / 2 - np.log2(1 + BALANCE)
         camera = "AB"[at % 2] if "cameras" in parts else "A"
         found[name] = {
             "stops": gains.tolist() if "exposure" in parts else [0.0] * 3,
