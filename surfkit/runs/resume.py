@@ -109,9 +109,8 @@ def difference_but_length(run: Run, there: Any) -> tuple[str, Any, Any] | None:
     old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
     if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
         return None
-    short, long = (
-        (old, run.recipe) if before < now else (run.recipe, old)
-    )  # counts of the longer one are the finer ones
+    # Counts of the longer one are the finer ones.
+    short, long = (old, run.recipe) if before < now else (run.recipe, old)
     scaled = replace(rescale_like(short, max(now, before) / min(now, before), long), lod=long.lod)  # which may differ
     pair = (scaled, long) if before < now else (long, scaled)
     return first_difference(*map(dump, pair))

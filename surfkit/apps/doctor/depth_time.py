@@ -55,8 +55,7 @@ def depth_seconds(
             return 0.0
     seconds = time.perf_counter() - begun
     done = [views[one.at].camera for one in made if one.inverse is not None]
-    largest = getattr(estimator, "longest", float("inf")) * getattr(
-        estimator, "scale", 1
-    )  # maps of larger ones are not
+    # Maps of larger photographs have no more pixels than this.
+    largest = getattr(estimator, "longest", float("inf")) * getattr(estimator, "scale", 1)
     pixels = sum(w * h * min(1.0, largest / max(w, h)) ** 2 for w, h in sizes)
     return seconds * pixels / sum(camera.width * camera.height for camera in done) if done else 0.0
