@@ -131,9 +131,11 @@ def recovered(out: Path, truth: dict[str, Any]) -> dict[str, float]:
 
     Exposures as shares of the light, each channel of each photograph, but for a factor that all photographs share; the
     light that vignetting leaves, as a share of that in the middle; and colours of one camera as the other would have
-    shown them, which the gains and the curves of cameras decide together.
+    shown them, which the gains and the curves of cameras decide together. Nothing where colours stay as they are.
     """
     record = read_json(out / "light.json", LightRecord)
+    if not record.is_used:
+        return {}
     photographs, cameras = record.photographs, list(record.cameras)
     stops, true = (
         np.array([each[name] for name in photographs])
