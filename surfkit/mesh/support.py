@@ -9,6 +9,12 @@ from surfkit.mesh.refine_vertices import beside
 from surfkit.mesh.view_observations import ViewObservations, boxes_of, for_all
 from surfkit.raster.native import kernels
 
+LARGE_CELLS = 16.0
+"""Cells along the longest edge, from which a face is confirmed only if several places on it are: its middle alone may
+happen to lie on the ground."""
+INNER_PLACES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (1, 2.5, 2.5), (2.5, 1, 2.5), (2.5, 2.5, 1))
+"""Of a large face, beside its middle: weights of its corners, in sixths."""
+
 
 def supported(
     sights: ViewObservations, points: np.ndarray, faces: np.ndarray, side: float, least_views: int, guesses: float
@@ -24,18 +30,30 @@ def supported(
         points: (P, 3) local.
         faces: (F, 3) rows of points.
         side: Of a cell, local units.
-        least_views: That confirm a face: each has a depth within half a cell of it.
+        least_views: That confirm a face: each has a depth within half a cell of its middle, and of further places on
+            large ones.
         guesses: Width of the disc, cells.
     """
-    native, threads = kernels(), torch.get_num_threads()
     corners = points[faces]
     middles = corners.mean(1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    views, at = np.zeros(len(faces), np.float32), middles.astype(np.float32)
+    large = np.flatnonzero(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1) > LARGE_CELLS * side)
+    inner = np.einsum("fkc,pk->pfc", corners[large], np.array(INNER_PLACES) / 6).reshape(-1, 3)
+    owners = np.concatenate([np.arange(len(faces)), np.tile(large, len(INNER_PLACES))])
+    there = np.concatenate([middles, inner])
+    views = np.full(len(faces), np.inf)
+    np.minimum.at(views, owners, confirming(sights, there, normals[owners], side))
+    return closed(views >= least_views, middles, faces, guesses / 2 * side)
+
+
+def confirming(sights: ViewObservations, places: np.ndarray, normals: np.ndarray, side: float) -> np.ndarray:
+    """(F,) float32, how many views have a depth within half a cell of (F, 3) places with (F, 3) unit normals."""
+    native, threads = kernels(), torch.get_num_threads()
+    views, at = np.zeros(len(places), np.float32), places.astype(np.float32)
     job = at, boxes_of(at), normals.astype(np.float32), 0.5 * side, views
     for_all(sights, "confirming", lambda sight: native.confirm(*job, *sight.native, threads))
-    return closed(views >= least_views, middles, faces, guesses / 2 * side)
+    return views
 
 
 def closed(sure: np.ndarray, middles: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:

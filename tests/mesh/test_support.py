@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from surfkit.mesh.support import closed
+from surfkit.mesh import support
+from surfkit.mesh.support import closed, supported
 
 SIDE = 60
 
@@ -60,3 +61,21 @@ def test_the_end_of_the_surface_is_outside():
 def test_nothing_is_sure():
     all_, any_ = closed_cells(np.zeros((SIDE, SIDE), bool), 1e6)
     assert not any_.any() and not all_.any()
+
+
+def test_a_large_face_is_confirmed_at_several_places(monkeypatch):
+    """The middle of a sliver along the rim may lie on ground that views see, and its ends beside it."""
+    points = np.array([[0, 0, 0], [40, 0, 0], [20, 30, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    faces, looked = np.array([[0, 1, 2], [0, 3, 4]]), []
+
+    def disc(sights, places, normals, side):
+        looked.append((places, normals))
+        return np.where(np.linalg.norm(places - (20, 10, 0), axis=1) < sights, 3.0, 0.0).astype(np.float32)
+
+    monkeypatch.setattr(support, "confirming", disc)
+    assert supported(100.0, points, faces, 1.0, 2, 0.0).tolist() == [True, True]
+    assert supported(19.9, points, faces, 1.0, 2, 0.0).tolist() == [True, False], "all places of the large one are seen"
+    assert supported(8.0, points, faces, 1.0, 2, 0.0).tolist() == [False, False]
+    (places, normals), *_ = looked
+    assert len(places) == 2 + 6 and (normals == (0, 0, 1)).all() and np.allclose(places[[0, 2, 3]].mean(0)[2], 0)
+    assert supported(8.0, points, faces, 3.0, 2, 0.0).tolist() == [True, False], "at larger cells it is a small face"
