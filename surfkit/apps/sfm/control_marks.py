@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from surfkit.apps.sfm.control_list import MIN_POINT_PHOTOS, GroundControlPoint
+from surfkit.apps.sfm.control_list import MIN_CONTROL_POINTS, MIN_POINT_PHOTOS, GroundControlPoint
 from surfkit.core.codec import write_text
 
 MARK_OUTLIER_SIGMAS = 4.0
@@ -138,14 +138,14 @@ def size_ratio(images: Images, points: Sequence[GroundControlPoint]) -> float | 
 
 def _error_at(images: Images, points: Sequence[GroundControlPoint], ratio: float) -> float:
     """Median over points of how far their marks are from where their rays meet (RMS), were they of photographs of
-    `ratio` times the size; pixels of the marks."""
+    `ratio` times the size; pixels of the marks, infinite where too few points tell."""
     errors = []
     for point in points:
         marks = {name: (x / ratio, y / ratio) for name, (x, y) in point.marks.items() if name in images}
         if (xyz := triangulate(images, marks)) is not None:
             left = list(mark_residuals(images, marks, xyz).values())
             errors.append(ratio * float(np.sqrt(np.square(left).sum(1).mean())) if len(left) == len(marks) else np.inf)
-    return float(np.median(errors)) if errors else np.inf
+    return float(np.median(errors)) if len(errors) >= MIN_CONTROL_POINTS else np.inf
 
 
 def _drops(images: Images, marks: Mapping[str, tuple[float, float]]) -> dict[str, float]:
