@@ -45,6 +45,8 @@ MAX_ADJUSTMENTS = 12
 """To find wrong points: each takes one."""
 MIN_TIE_SIGMA = 0.05
 """No tie point is more exact, pixels."""
+MAX_MARK_SIGMA_PX = 30.0
+"""Nobody marks a point so inaccurately: farther off, it is another point."""
 MEAN_OF_RAYLEIGH = math.sqrt(math.pi / 2)
 """Mean length of residuals whose two coordinates have a standard deviation of 1."""
 
@@ -92,12 +94,16 @@ def clean_marks(model: Any, ground: GroundControl, settings: Settings) -> tuple[
 
 
 def said_of(wrong: Sequence[WrongMark]) -> str:
-    """Which points have marks that contradict the others, as the end of a message; nothing where none has."""
-    away = [mark.pixels for mark in wrong if mark.pixels is not None]
+    """Which points have marks that contradict the others, as the end of a message; nothing where none has.
+
+    Pairs that contradict each other by little may be as good as their marks are; one mark against others is a mistake.
+    """
     if not wrong:
         return ""
     names = list(dict.fromkeys(mark.point for mark in wrong))
-    less = f"; if they are no more accurate, add --mark-sigma {np.median(away):.0f}" if away else ""
+    away = [mark.pixels for mark in wrong if mark.pixels is not None and not mark.certain]
+    sigma = float(np.median(away)) if away else math.inf
+    less = f"; if they are no more accurate, add --mark-sigma {sigma:.2g}" if sigma <= MAX_MARK_SIGMA_PX else ""
     return f". Marks that contradict each other are left out of {few(names)}{less}"
 
 

@@ -29,6 +29,8 @@ from surfkit.io.datasets.topocentric import Similarity
 
 STATED_TIMES = 3.0
 """Residuals of a coordinate up to so many times the stated standard deviation are as good as the points are."""
+MAX_SURVEY_SIGMA_M = 10.0
+"""No receiver is less accurate: larger residuals are those of a wrong list."""
 
 
 @dataclass(frozen=True)
@@ -159,12 +161,12 @@ def place_by_points(
     along, across = given.scale * sizes[:2] * chart.metres
     if rms > MAX_TURN_ERROR * across and rms > STATED_TIMES * sigma_m:
         worst = sorted(used, key=lambda at: -float(np.linalg.norm(left[at])))
+        less = f" If the points were surveyed no better, add --gcp-sigma {rms:.2g}" if rms <= MAX_SURVEY_SIGMA_M else ""
         said = few([f"{points[seen[at]].name} ({np.linalg.norm(left[at]):.1f} m)" for at in worst])
         return NoSimilarity(
-            f"residuals of {rms:.1f} m a coordinate are too large for {len(used)} ground control points that spread by "
+            f"residuals of {rms:.2g} m a coordinate are too large for {len(used)} ground control points that spread by "
             f"{along / np.sqrt(len(used)):.0f} and {across / np.sqrt(len(used)):.0f} m: {said}. Are the marks on the "
-            "points and in these photographs, and the coordinates in the system that the list names? If the points "
-            f"were surveyed no better, add --gcp-sigma {rms:.1f}"
+            f"points and in these photographs, and the coordinates in the system that the list names?{less}"
         )
     return ControlResiduals(
         chart,

@@ -107,6 +107,11 @@ class Settings:
     either; blend composites them over black, ignore takes their colours as stored. Default: blend, but ignore where a
     fourth band of a TIFF file is no opacity."""
 
+    @property
+    def worst_gcp_sigma(self) -> float:
+        """Standard deviation of the least accurate coordinate of the surveyed points, metres."""
+        return max(self.gcp_sigma, self.gcp_sigma_up or 0.0)
+
     def __post_init__(self) -> None:
         ranges = {
             "longest": (100, 20_000),

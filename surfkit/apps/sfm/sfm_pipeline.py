@@ -300,7 +300,7 @@ class SfmPreparation:
     ) -> ControlResiduals | NoSimilarity:
         """The model by control points, unless these put it where no survey can be; says what is doubtful."""
         given = self.settings
-        where = place_by_points(model, ground, given.checkpoints, given.checkpoint_names, given.gcp_sigma)
+        where = place_by_points(model, ground, given.checkpoints, given.checkpoint_names, given.worst_gcp_sigma)
         if isinstance(where, NoSimilarity):
             return where
         if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):

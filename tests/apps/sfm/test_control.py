@@ -254,9 +254,12 @@ def control(wrong):
 
 
 def test_a_refusal_says_which_points_have_wrong_marks():
-    wrong = [WrongMark("G1", "a", 4.0, True), WrongMark("G2", "a", 8.0, False), WrongMark("G2", "b", None, False)]
-    assert said_of([]) == "" and said_of(wrong).endswith("'G1', 'G2'; if they are no more accurate, add --mark-sigma 6")
-    assert said_of(wrong[2:]).endswith("are left out of 'G2'")
+    pair = [WrongMark("G2", "a", 8.0, False), WrongMark("G2", "b", 4.0, False)]
+    mistake, behind = WrongMark("G1", "a", 5000.0, True), WrongMark("G3", "b", None, False)
+    assert said_of([]) == ""
+    assert said_of([mistake, *pair]).endswith("'G1', 'G2'; if they are no more accurate, add --mark-sigma 6")
+    assert said_of([mistake, behind]).endswith("are left out of 'G1', 'G3'"), "no accuracy explains them"
+    assert said_of([replace(mark, pixels=40 * mark.pixels) for mark in pair]).endswith("'G2'")
 
 
 def test_positions_of_photographs_keep_their_common_error(flown, tmp_path):

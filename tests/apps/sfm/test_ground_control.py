@@ -14,6 +14,7 @@ from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.georeference import NoSimilarity
 from surfkit.apps.sfm.ground_control import doubts, place_by_points
 from surfkit.apps.sfm.inspect_photos import Photo
+from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.survey_plausibility import upside_down
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.raw_dataset import load_pycolmap
@@ -189,6 +190,9 @@ def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):
     places = np.random.default_rng(5).permutation(PLACES)
     found = place_by_points(model(), read_ground(written(tmp_path / "gcp_list.txt", places=places), "auto", SIZES), 0)
     assert isinstance(found, NoSimilarity) and "too large for" in found.reason
+    far = written(tmp_path / "far.txt", places=30 * places)
+    found = place_by_points(model(), read_ground(far, "auto", SIZES), 0)
+    assert "too large for" in found.reason and "--gcp-sigma" not in found.reason, "no receiver is so inaccurate"
 
 
 def test_points_as_inaccurate_as_stated_place_the_model_and_what_it_is_worth_is_told(tmp_path):
@@ -200,6 +204,7 @@ def test_points_as_inaccurate_as_stated_place_the_model_and_what_it_is_worth_is_
     assert float(off) == pytest.approx(1.5, rel=0.5)
     stated = place_by_points(model(), ground, 0, sigma_m=1.5)
     assert max(stated.residuals, key=lambda name: np.linalg.norm(stated.residuals[name])) == said
+    assert Settings(gcp=tmp_path, gcp_sigma=0.02, gcp_sigma_up=1.5).worst_gcp_sigma == 1.5
     away = abs(stated.similarity.scale / 10 - 1)
     assert 0.05 < stated.turn_error < 0.3 and away < 3 * stated.turn_error
     (doubt,) = doubts(stated, {"0.jpg": np.zeros(3)}, [])
