@@ -76,10 +76,29 @@ def from_arrays(
     expect("points", places, ("P", 3))
     paint = np.full(places.shape, 128, np.uint8) if colors is None else np.asarray(colors)
     expect("colors", paint, places.shape)
+    _write(root, names, pictures, cameras, lenses, places, paint)
+    doubt = _doubt(pictures, cameras, lenses, places, paint) if colors is not None else None
+    found = read(root, **options)
+    if doubt is None:
+        return found
+    with heard():
+        emit(Warned(doubt))
+    return replace(found, findings=(*found.findings, doubt))
 
+
+def _write(
+    root: Path,
+    names: Sequence[str],
+    pictures: Sequence[np.ndarray],
+    cameras: np.ndarray,
+    lenses: np.ndarray,
+    places: np.ndarray,
+    paint: np.ndarray,
+) -> None:
+    """Photographs, cameras and points as COLMAP's text; shapes as of `from_arrays`."""
     model = root / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
-    write_json(root / MARK, {"images": count, "points": len(places)})
+    write_json(root / MARK, {"images": len(names), "points": len(places)})
     lines: dict[str, list[str]] = {"cameras": [], "images": [], "points3D": []}
     for i, (name, picture, pose, lens) in enumerate(zip(names, pictures, cameras, lenses, strict=True), 1):
         path = root / "images" / name
@@ -94,13 +113,6 @@ def from_arrays(
         lines["points3D"].append(f"{i} {_row(place)} {' '.join(str(int(part)) for part in color)} 0\n")
     for part, text in lines.items():
         (model / f"{part}.txt").write_text("".join(text))
-    doubt = _doubt(pictures, cameras, lenses, places, paint) if colors is not None else None
-    found = read(root, **options)
-    if doubt is None:
-        return found
-    with heard():
-        emit(Warned(doubt))
-    return replace(found, findings=(*found.findings, doubt))
 
 
 def _doubt(

@@ -160,14 +160,8 @@ def place_by_points(
     rms = float(np.sqrt((left[used] ** 2).sum() / (3 * max(len(used) - PARAMETERS, 1))))
     along, across = given.scale * sizes[:2] * chart.metres
     if rms > MAX_TURN_ERROR * across and rms > STATED_TIMES * sigma_m:
-        worst = sorted(used, key=lambda at: -float(np.linalg.norm(left[at])))
-        less = f" If the points were surveyed no better, add --gcp-sigma {rms:.2g}" if rms <= MAX_SURVEY_SIGMA_M else ""
-        said = few([f"{points[seen[at]].name} ({np.linalg.norm(left[at]):.1f} m)" for at in worst])
-        return NoSimilarity(
-            f"residuals of {rms:.2g} m a coordinate are too large for {len(used)} ground control points that spread by "
-            f"{along / np.sqrt(len(used)):.0f} and {across / np.sqrt(len(used)):.0f} m: {said}. Are the marks on the "
-            f"points and in these photographs, and the coordinates in the system that the list names?{less}"
-        )
+        away = {points[seen[at]].name: float(np.linalg.norm(left[at])) for at in used}
+        return NoSimilarity(_too_large(rms, away, along / np.sqrt(len(used)), across / np.sqrt(len(used))))
     return ControlResiduals(
         chart,
         given,
@@ -179,6 +173,18 @@ def place_by_points(
         hand.right,
         {point.name: tuple(row) for point, row in zip(points, onto.tolist(), strict=True)},
         turn_error=float(rms / across),
+    )
+
+
+def _too_large(rms: float, away: Mapping[str, float], along: float, across: float) -> str:
+    """What is said where residuals, `rms` a coordinate and `away` by the name of a point, do not fit the spread of the
+    points; metres all."""
+    worst = few([f"{name} ({away[name]:.1f} m)" for name in sorted(away, key=lambda name: -away[name])])
+    less = f" If the points were surveyed no better, add --gcp-sigma {rms:.2g}" if rms <= MAX_SURVEY_SIGMA_M else ""
+    return (
+        f"residuals of {rms:.2f} m a coordinate are too large for {len(away)} ground control points that spread by "
+        f"{along:.0f} and {across:.0f} m: {worst}. Are the marks on the points and in these photographs, and the "
+        f"coordinates in the system that the list names?{less}"
     )
 
 
