@@ -62,8 +62,8 @@ def scene(kind: str, count: int, device: torch.device) -> tuple[Splats, Camera]:
     """Splats with harmonics of degree 3, whose size falls with their number so that as much is drawn."""
     splats, camera = city(kind, count, *SIZE)
     smaller = (200_000 / count) ** 0.5
-    sh = torch.cat([splats.sh, 0.05 * torch.randn(count, 15, 3)], 1)
-    tensors = {**splats.tensors(), "scales": splats.scales * smaller, "sh": sh}
+    rest = 0.05 * torch.randn(count, 15, 3)
+    tensors = {**splats.tensors(), "scales": splats.scales * smaller, "sh_rest": rest}
     return splats.with_named({name: value.to(device) for name, value in tensors.items()}), camera
 
 

@@ -222,8 +222,8 @@ def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
     splats, camera = city("surfel", round(count * share), *PIECE)
     wider = 1600 / PIECE[0] * (200_000 / count) ** 0.5  # as large in pixels as in the whole view
     tensors = splats.tensors()
-    sh = torch.cat([splats.sh, torch.zeros(len(splats), 15, 3)], 1)
-    splats = splats.with_named({**tensors, "scales": splats.scales * wider, "sh": sh})
+    rest = torch.zeros(len(splats), 15, 3)
+    splats = splats.with_named({**tensors, "scales": splats.scales * wider, "sh_rest": rest})
     launches: dict[str, Launch] = {}
 
     class Emulation(TileRasterizer):

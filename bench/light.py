@@ -11,6 +11,7 @@ Variants of a rendered survey (shibuya-synth), with seeds that never change; bes
     cameras     two cameras, named in EXIF, with other response curves, take turns
     all         all of them
     unclipped   all of them, with half the range of exposure, and so dark that no white is cut off
+    restored    unclipped, brought back to one light by the truth: what is left is lost in 8 bits, for any model of light
 
 Light is changed as in a camera: sRGB is decoded, multiplied, limited to 1, encoded, and put through the response curve.
 Each variant is trained without and with each appearance, one run after the other, on every photograph that is not held
@@ -58,6 +59,7 @@ VARIANTS = {
     "cameras": ("cameras",),
     "all": ("exposure", "vignetting", "cameras"),
     "unclipped": ("exposure", "vignetting", "cameras", "unclipped"),
+    "restored": ("exposure", "vignetting", "cameras", "unclipped", "restored"),
 }
 STOPS, BALANCE, CORNER = 1.5, 0.15, 0.5
 RESPONSES = {"A": 0.85, "B": 1.2}
@@ -86,11 +88,22 @@ def truth_of(names: list[str], parts: tuple[str, ...]) -> dict[str, Any]:
 
 def changed(pixels: np.ndarray, how: dict[str, Any]) -> np.ndarray:
     """(H, W, 3) uint8, a photograph with its light changed."""
+    light = linear(pixels / 255.0) * factor(pixels, how)
+    return (from_linear(light.clip(0, 1)) ** how["exponent"] * 255).round().astype(np.uint8)
+
+
+def restored(pixels: np.ndarray, how: dict[str, Any]) -> np.ndarray:
+    """(H, W, 3) uint8, the other way round."""
+    light = linear((pixels / 255.0) ** (1 / how["exponent"])) / factor(pixels, how)
+    return (from_linear(light.clip(0, 1)) * 255).round().astype(np.uint8)
+
+
+def factor(pixels: np.ndarray, how: dict[str, Any]) -> np.ndarray:
+    """(H, W, 3) of the light of a photograph."""
     height, width = pixels.shape[:2]
     y, x = np.mgrid[:height, :width] + 0.5
     r2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width**2 + height**2) * 4
-    light = linear(pixels / 255.0) * np.exp2(how["stops"]) * (1 - (1 - how["corner"]) * r2)[..., None]
-    return (from_linear(light.clip(0, 1)) ** how["exponent"] * 255).round().astype(np.uint8)
+    return np.exp2(how["stops"]) * (1 - (1 - how["corner"]) * r2)[..., None]
 
 
 def write_variant(pack: Path, to: Path, parts: tuple[str, ...]) -> dict[str, Any]:
@@ -103,8 +116,12 @@ def write_variant(pack: Path, to: Path, parts: tuple[str, ...]) -> dict[str, Any
             pixels = np.asarray(photo.convert("RGB"))
         exif = Image.Exif()
         exif[0x010F], exif[0x0110] = "surfkit", f"camera {truth[name]['camera']}"
-        made = Image.fromarray(changed(pixels, truth[name])) if parts else Image.fromarray(pixels)
+        made = Image.fromarray(changed(pixels, truth[name]) if parts else pixels)
         made.save(to / "images" / name, quality=97, subsampling=0, exif=exif)
+        if "restored" in parts:
+            with Image.open(to / "images" / name) as photo:
+                back = restored(np.asarray(photo), truth[name])
+            Image.fromarray(back).save(to / "images" / name, quality=100, subsampling=0, exif=exif)
     model = load_pycolmap().Reconstruction(str(pack / "sparse/0"))
     model.extract_colors_for_all_images(str(to / "images"))  # as a program that found the points would have had them
     (to / "sparse/0").mkdir(parents=True)
@@ -116,7 +133,7 @@ def write_variant(pack: Path, to: Path, parts: tuple[str, ...]) -> dict[str, Any
 def train(data: Path, out: Path, appearance: str, options: argparse.Namespace) -> None:
     """A run of the recipe, whose messages go to a file beside it."""
     words = [f"recipe:{options.recipe}", "--data", str(data), "--out", str(out), "--scale", str(options.scale)]
-    words += ["--steps", str(options.steps), "--test-every", "8", "--device", "cpu"]
+    words += ["--steps", str(options.steps), "--test-every", "8", "--device", "cpu", "--seed", str(options.seed)]
     words += [f"pretrain.appearance:{appearance}", *["mesh:none"] * (options.gt is None)]
     commands = [["train", *words]]
     if options.gt is not None:
@@ -218,6 +235,7 @@ def main() -> None:
     parser.add_argument("--recipe", default="2dgs")
     parser.add_argument("--scale", type=float, default=4.0)
     parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--gt", type=Path, help="truth of the mesh, which is made and measured with it; none else")
     parser.add_argument("--work", type=Path, help="folder for data sets and runs; a temporary one if left out")
     parser.add_argument("--name", default="light", help="of the file in bench/results")

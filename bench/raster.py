@@ -31,8 +31,7 @@ def parts_of(kind: str, rounds: int) -> dict[str, float]:
     cotangents = Maps(**{name: torch.randn_like(value) for name, value in maps.items()})
     color_only = Maps(color=cotangents.color)
     native, threads = render._pass.native, torch.get_num_threads()
-    sh = torch.zeros(len(splats), 16, 3)
-    columns = {**splats.tensors(), "sh": sh}
+    columns = {**splats.tensors(), "sh_rest": torch.zeros(len(splats), 15, 3)}
     moments = {name: (torch.zeros_like(v), torch.zeros_like(v)) for name, v in columns.items()}
 
     def losses() -> torch.Tensor:

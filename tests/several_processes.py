@@ -21,7 +21,7 @@ from surfkit.train.exchange import DividedRasterizer
 from surfkit.train.processes import Processes
 from surfkit.train.shards import load_share, save_shares
 
-COLUMNS = ("means", "quats", "scales", "opacities", "sh", "signal", "chosen")
+COLUMNS = ("means", "quats", "scales", "opacities", "sh0", "sh_rest", "signal", "chosen")
 
 
 def camera() -> Camera:
@@ -32,13 +32,17 @@ def crowd(kind: str, geometry: str = "axis") -> Splats:
     """Splats in front of the camera and beside it, each in several tiles."""
     draw, count = torch.Generator().manual_seed(3), 300
     means = torch.rand(count, 3, generator=draw) * torch.tensor([1.6, 1.8, 1.0]) + torch.tensor([-0.8, -0.9, 1.0])
+    quats = torch.randn(count, 4, generator=draw)
+    scales = torch.rand(count, 2 if kind == "surfel" else 3, generator=draw) * 0.08 + 0.01
+    opacities, sh = torch.rand(count, generator=draw), torch.randn(count, 9, 3, generator=draw) * 0.3
     return Splats(
         kind=kind,
         means=means,
-        quats=torch.randn(count, 4, generator=draw),
-        scales=torch.rand(count, 2 if kind == "surfel" else 3, generator=draw) * 0.08 + 0.01,
-        opacities=torch.rand(count, generator=draw),
-        sh=torch.randn(count, 9, 3, generator=draw) * 0.3,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        sh0=sh[:, :1],
+        sh_rest=sh[:, 1:],
         geometry=geometry,
     )
 

@@ -83,10 +83,11 @@ def drawn(splats: SplatTable, camera: Camera, frame: Frame, near: float, rasteri
         "quats": splats.quats,
         "scales": splats.scales * frame.scale,
         "opacities": splats.opacities,
-        "sh": torch.cat([splats.sh0[:, None], splats.sh_rest], 1),
+        "sh0": splats.sh0[:, None],
+        "sh_rest": splats.sh_rest,
     }
-    means, quats, scales, opacities, sh = (value.detach().float() for value in named.values())
-    local = Splats(splats.kind, means, quats, scales, opacities, sh, antialias=splats.antialias)
+    standard: dict[str, Any] = {name: value.detach().float() for name, value in named.items()}
+    local = Splats(splats.kind, **standard, antialias=splats.antialias)
     render = rasterizer.render(local, camera, near, distortion=False)
     names = list(render.maps.present())
     return Maps(**dict(zip(names, _Drawn.apply(render, names, list(named), *named.values()), strict=True)))  # type: ignore[no-untyped-call]

@@ -177,8 +177,8 @@ class Primitive(Component):
                 quats=splats.quats,
                 log_scales=splats.scales.log(),
                 opacity_logits=params["opacities"] if exact else logits(splats.opacities),
-                sh0=splats.sh[:, 0],
-                sh_rest=splats.sh[:, 1:],
+                sh0=splats.sh0[:, 0],
+                sh_rest=splats.sh_rest,
                 antialias=splats.antialias,
             )
 
@@ -223,11 +223,9 @@ class Primitive(Component):
 
 
 def harmonics(params: Columns, degree: int) -> Tensor:
-    """(N, (degree + 1)^2, 3) coefficients in use."""
-    if degree == 0:
-        return params["sh0"]
+    """(N, (degree + 1)^2 - 1, 3) coefficients in use of the degrees above 0; the column itself where all are."""
     rest, used = params["sh_rest"], (degree + 1) ** 2 - 1
-    return torch.cat([params["sh0"], rest if rest.shape[1] == used else rest[:, :used]], dim=1)
+    return rest if rest.shape[1] == used else rest[:, :used]
 
 
 def logits(opacities: Tensor) -> Tensor:

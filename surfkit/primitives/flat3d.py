@@ -61,7 +61,8 @@ class Flat3D(Primitive):
             quats=params["quats"],
             scales=self._three(params["scales"]),
             opacities=SIGMOID.value(params["opacities"]),
-            sh=harmonics(params, degree),
+            sh0=params["sh0"],
+            sh_rest=harmonics(params, degree),
             antialias=self.antialias,
         )
 

@@ -42,5 +42,6 @@ class Surfel2D(Smoothable, Primitive):
             quats=params["quats"],
             scales=scales,
             opacities=opacities,
-            sh=harmonics(params, degree),
+            sh0=params["sh0"],
+            sh_rest=harmonics(params, degree),
         )

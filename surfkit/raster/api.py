@@ -34,7 +34,7 @@ CUTOFF = math.sqrt(2 * math.log(255))
 MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
 """Names in the order of `Maps`; the kernels make the first 2, the first 5 or all of them."""
 
-STANDARD = ("means", "quats", "scales", "opacities", "sh")
+STANDARD = ("means", "quats", "scales", "opacities", "sh0", "sh_rest")
 """Tensors that all splats have."""
 
 DILATION = 0.3
@@ -64,7 +64,9 @@ class Splats:
         quats: (N, 4) wxyz.
         scales: (N, 2) for surfels, (N, 3) for gaussians; local units, positive.
         opacities: (N,) in [0, 1].
-        sh: (N, K, 3) spherical harmonics with K in {1, 4, 9, 16}.
+        sh0: (N, 1, 3) spherical harmonics of degree 0.
+        sh_rest: (N, K - 1, 3) those of higher degrees, K in {1, 4, 9, 16}; none, if not given. They are apart, as they
+            are trained at rates of their own: to join them would copy three quarters of a point in each step.
         antialias: Gaussians only: lower the opacity by what the dilation adds to the footprint.
         dilation: Gaussians only: variance that is added to the footprint, px^2.
         geometry: Gaussians only. "axis": footprint by EWA splatting, the normal is the shortest axis. "plane": the same
@@ -79,15 +81,29 @@ class Splats:
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    sh: Tensor
+    sh0: Tensor
+    sh_rest: Tensor = None  # type: ignore[assignment]  # then made in __post_init__
     antialias: bool = False
     dilation: float = DILATION
     geometry: str = "axis"
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     shared: Mapping[str, Tensor] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if self.sh_rest is None:
+            object.__setattr__(self, "sh_rest", self.sh0.new_zeros(len(self.sh0), 0, 3))
+
     def __len__(self) -> int:
         return len(self.means)
+
+    @property
+    def sh(self) -> Tensor:
+        """(N, K, 3), all harmonics; a copy."""
+        return torch.cat([self.sh0, self.sh_rest], 1)
+
+    def with_colors(self, sh0: Tensor) -> Splats:
+        """The same with harmonics of degree 0 alone, (N, 1, 3)."""
+        return replace(self, sh0=sh0, sh_rest=sh0.new_zeros(len(sh0), 0, 3))
 
     def and_then(self, others: Splats) -> Splats:
         """These and others of the same kind, in this order."""
@@ -111,7 +127,7 @@ class Splats:
         return self._with(lambda value, _: value[rows], self)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five standard tensors by name, (N, ...) each, in the order of the fields."""
+        """The standard tensors by name, (N, ...) each, in the order of the fields."""
         return {name: getattr(self, name) for name in STANDARD}
 
     def named(self) -> dict[str, Tensor]:
@@ -215,7 +231,7 @@ class Gradients:
     thresholds expect. Surfels: (dL/dT_u.z, dL/dT_v.z) T_w.z (2DGS), the low-pass centre included.
 
     Attributes:
-        means, quats, scales, opacities, sh: Shapes of `Splats`.
+        means, quats, scales, opacities, sh0, sh_rest: Shapes of `Splats`.
         signal: (N, 2) of the total loss.
         chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels; None if no second
             cotangent was given.
@@ -227,14 +243,15 @@ class Gradients:
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    sh: Tensor
+    sh0: Tensor
+    sh_rest: Tensor
     signal: Tensor
     chosen: Tensor | None = None
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     derived: Derived | None = None
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five standard gradients by name, (N, ...) each, in the order of `Splats.tensors`."""
+        """The standard gradients by name, (N, ...) each, in the order of `Splats.tensors`."""
         return {name: getattr(self, name) for name in STANDARD}
 
     def named(self) -> dict[str, Tensor]:

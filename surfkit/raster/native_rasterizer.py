@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -50,7 +50,7 @@ class NativeRasterizer(Rasterizer):
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
-        grey = replace(splats, sh=torch.zeros(len(splats), 1, 3))  # colours cost a third of the projection
+        grey = splats.with_colors(torch.zeros(len(splats), 1, 3))  # colours cost a third of the projection
         drawn = Pass(grey, camera, near)
         total = torch.zeros(len(splats), dtype=torch.float32)
         count = torch.zeros(len(splats), dtype=torch.int64)
@@ -58,7 +58,7 @@ class NativeRasterizer(Rasterizer):
         return total, count
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-        drawn = Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
+        drawn = Pass(splats.with_colors(torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
         opacity = torch.empty(len(points), dtype=torch.float32)
         drawn.native.probe(camera.project(points).contiguous(), opacity, torch.get_num_threads())
         return opacity
@@ -94,13 +94,13 @@ def pose_and_lens(camera: Camera) -> tuple[list[float], list[float], int, int]:
 class Pass:
     """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn.
 
-    Only tiles of the rows of a `strip` are drawn, with the bits of the whole image. `sh` may be (N, 3) colours.
+    Only tiles of the rows of a `strip` are drawn, with the bits of the whole image. `sh0` may be (N, 3) colours.
     """
 
     def __init__(
         self, splats: Splats, camera: Camera, near: float, rim: float = 0.5, strip: tuple[int, int] = WHOLE_IMAGE
     ) -> None:
-        validate(splats if splats.sh.dim() > 2 else replace(splats, sh=splats.sh[:, None]), values=False)
+        validate(splats if splats.sh0.dim() > 2 else splats.with_colors(splats.sh0[:, None]), values=False)
         self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         self.seen = torch.empty(len(splats), dtype=torch.bool)
         self.radii = torch.empty(len(splats), dtype=torch.float32)

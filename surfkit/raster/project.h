@@ -23,8 +23,8 @@ SPLAT_FN R clamped(R x, R low, R high) {
     return splat::smallest(splat::largest(x, low), high);
 }
 
-// Row i of activated values. `Arrays` has means, quats, scales (2 or 3 columns), opacities, sh and the number of its
-// coefficients.
+// Row i of activated values. `Arrays` has means, quats, scales (2 or 3 columns), opacities, sh0, sh_rest and the number
+// of coefficients.
 template <class Arrays>
 SPLAT_FN SplatIn<Real> read_splat(const Arrays& s, long long i, int columns) {
     SplatIn<Real> o{};
@@ -48,14 +48,19 @@ SPLAT_FN bool valid(const SplatIn<Real>& s, int columns) {
     return none == 0 && positive;
 }
 
+// Coefficient k of channel c of splat i.
+template <class Arrays>
+SPLAT_FN float harmonic(const Arrays& s, long long i, int k, int c) {
+    return k ? s.sh_rest[3 * ((s.coefficients - 1) * i + k - 1) + c] : s.sh0[3 * i + c];
+}
+
 // Colour of a splat, below 0 too. The first term is exact: a black point has a colour of 0 but for what its number was
 // rounded by, and it depends on the sign of that whether it can learn.
 template <class Arrays, class R>
 SPLAT_FN void shade(const Arrays& s, long long i, const splat::Sight<R>& sight, R rgb[3]) {
-    const long long row = 3LL * s.coefficients * i;
-    for (int c = 0; c < 3; c++) rgb[c] = R(Real(0.5) + s.sh[row + c] * Real(0.28209479177387814));
+    for (int c = 0; c < 3; c++) rgb[c] = R(Real(0.5) + harmonic(s, i, 0, c) * Real(0.28209479177387814));
     for (int k = 1; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) rgb[c] += sight.basis[k] * s.sh[row + 3 * k + c];
+        for (int c = 0; c < 3; c++) rgb[c] += sight.basis[k] * harmonic(s, i, k, c);
 }
 
 // How a colour follows its splat: whether each channel is above 0, and if so its gradient by the mean.
@@ -67,12 +72,11 @@ struct Tint {
 template <class Arrays, class R>
 SPLAT_FN Tint<R> tint(const Arrays& s, long long i, const splat::Sight<R>& sight, const R rgb[3]) {
     Tint<R> o{};
-    const long long row = 3LL * s.coefficients * i;
     for (int c = 0; c < 3; c++) {
         o.is_lit[c] = rgb[c] > 0;
         if (!o.is_lit[c] || s.coefficients == 1 || !(sight.length > 0)) continue;
         R by_basis[16];
-        for (int k = 0; k < s.coefficients; k++) by_basis[k] = s.sh[row + 3 * k + c];
+        for (int k = 0; k < s.coefficients; k++) by_basis[k] = harmonic(s, i, k, c);
         o.by_mean[c] = splat::sight_backward(sight, s.coefficients, by_basis);
     }
     return o;

@@ -85,8 +85,8 @@ def colors(splats: Splats, camera: Camera) -> Tensor:
     offset = splats.means - camera.centre.to(splats.means)
     length = offset.norm(dim=1, keepdim=True)
     directions = offset / torch.where(length > 0, length, 1.0)
-    basis = sh_basis(directions, splats.sh.shape[1])
-    return ((basis[:, :, None] * splats.sh).sum(1) + 0.5).clamp_min(0)
+    sh = splats.sh
+    return ((sh_basis(directions, sh.shape[1])[:, :, None] * sh).sum(1) + 0.5).clamp_min(0)
 
 
 def facing(normals: Tensor, centres: Tensor) -> Tensor:

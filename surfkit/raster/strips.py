@@ -6,8 +6,6 @@ harmonics its colour in this view, which its owner works out: 13 numbers instead
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -35,14 +33,13 @@ def pixel_rows(strip: Strip, camera: Camera) -> slice:
 
 def colors(splats: Splats, camera: Camera, rows: Tensor) -> Tensor:
     """(R, 3) colours in a view of the splats of (R,) rows, below 0 too."""
-    means, sh = (value.detach().contiguous() for value in (splats.means, splats.sh))
     found = torch.empty(len(rows), 3)
-    native.kernels().shade(means, sh, rows, *pose_and_lens(camera), 0.0, found, torch.get_num_threads())
+    native.kernels().shade(_shading(splats), rows, *pose_and_lens(camera), 0.0, found, torch.get_num_threads())
     return found
 
 
 def colors_backward(
-    splats: Splats, camera: Camera, rows: Tensor, by_colors: Tensor, by_sh: Tensor, by_means: Tensor
+    splats: Splats, camera: Camera, rows: Tensor, by_colors: Tensor, by_sh: tuple[Tensor, Tensor], by_means: Tensor
 ) -> None:
     """Write gradients by the harmonics, and add those by the means, of the splats of some rows.
 
@@ -51,12 +48,18 @@ def colors_backward(
         camera: Of the view.
         rows: (R,) int64, different ones.
         by_colors: (R, 3) gradients by `colors`.
-        by_sh: (N, K, 3), of which these rows are written.
+        by_sh: (N, 1, 3) and (N, K - 1, 3), of which these rows are written.
         by_means: (N, 3), to these rows of which is added.
     """
-    means, sh = (value.detach().contiguous() for value in (splats.means, splats.sh))
     native.kernels().shade_backward(
-        means, sh, rows, *pose_and_lens(camera), 0.0, by_colors.contiguous(), by_sh, by_means, torch.get_num_threads()
+        _shading(splats),
+        rows,
+        *pose_and_lens(camera),
+        0.0,
+        by_colors.contiguous(),
+        *by_sh,
+        by_means,
+        torch.get_num_threads(),
     )
 
 
@@ -64,7 +67,12 @@ def contribution(
     colored: Splats, camera: Camera, near: float, powers: tuple[float, float], strip: Strip
 ) -> tuple[Tensor, Tensor]:
     """`Rasterizer.contribution` over the pixels of a strip: sums (N,) and counts (N,) int64."""
-    grey = replace(colored, sh=torch.zeros(len(colored), 3))
+    grey = colored.with_colors(torch.zeros(len(colored), 3))
     total, count = torch.zeros(len(colored)), torch.zeros(len(colored), dtype=torch.int64)
     Pass(grey, camera, near, strip=strip).native.contribution(*powers, total, count, torch.get_num_threads())
     return total, count
+
+
+def _shading(splats: Splats) -> list[Tensor]:
+    """What colours depend on: positions (N, 3) and harmonics (N, 1, 3) and (N, K - 1, 3)."""
+    return [value.detach().contiguous() for value in (splats.means, splats.sh0, splats.sh_rest)]

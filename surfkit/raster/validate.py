@@ -32,11 +32,12 @@ def validate(splats: Splats, values: bool = True) -> None:
     count = len(splats)
     columns = 2 if splats.kind == "surfel" else 3
     wanted: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": ()}
+    wanted["sh0"] = (1, 3)
     for name, tensor in splats.tensors().items():
         shape = tuple(tensor.shape)
-        if name == "sh":
-            if len(shape) != 3 or shape[0] != count or shape[1] not in (1, 4, 9, 16) or shape[2] != 3:
-                raise BadInput(f"splats.sh: shape {shape}; it must be ({count}, 1, 4, 9 or 16, 3)")
+        if name == "sh_rest":
+            if len(shape) != 3 or shape[0] != count or shape[1] not in (0, 3, 8, 15) or shape[2] != 3:
+                raise BadInput(f"splats.sh_rest: shape {shape}; it must be ({count}, 0, 3, 8 or 15, 3)")
         elif shape != (count, *wanted[name]):
             raise BadInput(f"splats.{name}: shape {shape}; a {splats.kind} needs {(count, *wanted[name])}")
     if not values:

@@ -51,9 +51,8 @@ def splats(kind: str = "surfel", count: int = 60) -> Splats:
     scales = 0.01 + 0.05 * torch.rand(count, 2 if kind == "surfel" else 3, generator=draw)
     quats = normalize(torch.randn(count, 4, generator=draw), dim=1)
     opacities = 0.05 + 0.9 * torch.rand(count, generator=draw)
-    return Splats(
-        kind, torch.rand(count, 3, generator=draw), quats, scales, opacities, torch.randn(count, 4, 3, generator=draw)
-    )
+    means, sh = torch.rand(count, 3, generator=draw), torch.randn(count, 4, 3, generator=draw)
+    return Splats(kind, means, quats, scales, opacities, sh[:, :1], sh[:, 1:])
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from surfkit.core.check import BadInput, expect
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Maps, Splats
+from surfkit.raster.api import STANDARD, Maps, Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.testing.equality import unchanged
@@ -67,8 +67,9 @@ def _check_columns(name: str, primitive: Primitive, params: Columns, count: int)
 
 def _check_splats(name: str, splats: Splats, degree: int) -> None:
     sizes = {"N": len(splats.means)}
-    shapes = {"means": ("N", 3), "quats": ("N", 4), "opacities": ("N",), "sh": ("N", (degree + 1) ** 2, 3)}
-    shapes["scales"] = ("N", 2 if splats.kind == "surfel" else 3)
+    axes, rest = 2 if splats.kind == "surfel" else 3, (degree + 1) ** 2 - 1
+    shapes: dict[str, tuple[str | int, ...]] = {"means": ("N", 3), "quats": ("N", 4), "scales": ("N", axes)}
+    shapes |= {"opacities": ("N",), "sh0": ("N", 1, 3), "sh_rest": ("N", rest, 3)}
     for field, shape in shapes.items():
         try:
             expect(f"{name}: {field}", getattr(splats, field), shape, sizes)
@@ -76,7 +77,8 @@ def _check_splats(name: str, splats: Splats, degree: int) -> None:
             raise AssertionError(str(error)) from error
     assert (splats.scales > 0).all(), f"{name}: scales must be positive"
     assert ((splats.opacities >= 0) & (splats.opacities <= 1)).all(), f"{name}: opacities must lie in [0, 1]"
-    assert torch.isfinite(splats.means).all() and torch.isfinite(splats.sh).all(), f"{name}: values are not finite"
+    finite = all(torch.isfinite(value).all() for value in (splats.means, splats.sh0, splats.sh_rest))
+    assert finite, f"{name}: values are not finite"
     assert not set(splats.extra) & set(splats.shared), f"{name}: extra and shared tensors have names in common"
 
 
@@ -142,7 +144,7 @@ def _check_table(name: str, primitive: Primitive, params: Columns) -> None:
         return  # from_table says what the primitive lacks
     _check_columns(f"{name}.from_table", primitive, again, len(params["means"]))
     before, after = (primitive.activate(each, primitive.sh_degree) for each in (params, again))
-    for field in ("means", "quats", "scales", "opacities", "sh"):
+    for field in STANDARD:
         close = torch.allclose(getattr(before, field), getattr(after, field), rtol=1e-3, atol=1e-5)
         assert close, f"{name}.from_table does not give back the {field} of its table"
 

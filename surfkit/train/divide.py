@@ -139,7 +139,7 @@ def of_all(processes: Processes, counts: Sequence[int], step: Step) -> Step:
         return processes.gathered(values, counts)
 
     def splats() -> Splats:
-        own = replace(step.splats, sh=step.splats.sh[:, :1])  # of colours, policies know those of degree 0
+        own = step.splats.with_colors(step.splats.sh0)  # of colours, policies know those of degree 0
         return own.with_named({name: gathered(getattr(own, name)) for name in STANDARD})
 
     return Step(

@@ -101,13 +101,14 @@ class Exchange:
         self.from_each = processes.swapped(self.sent)
 
     def received(self) -> Splats:
-        """(R,) splats that touch the strip of this process, in the order of the processes, with colours for sh."""
+        """(R,) splats that touch the strip of this process, in the order of the processes, with colours for `sh0`."""
         parts = [getattr(self.splats, name).detach().index_select(0, self.rows) for name in STANDARD[:4]]
         parts.append(colors(self.splats, self.camera, self.rows))
         means, quats, scales, opacities, color = [
             self.processes.exchanged(part, self.sent, self.from_each) for part in parts
         ]
-        return replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities, sh=color)
+        shapes = replace(self.splats, means=means, quats=quats, scales=scales, opacities=opacities)
+        return shapes.with_colors(color)
 
     def touched(self) -> Tensor:
         """(K,) int64, the splats that are sent, once each."""
@@ -157,15 +158,17 @@ class DividedRender(Render):
         if rows is not None and rows != len(self._splats):
             raise BadInput("splats that nothing changes are not drawn by several processes together; use --processes 1")
         means, quats, scales, opacities, color, signal, *more = self._sums(total, chosen, absolute)
-        by_sh, touched = torch.zeros_like(self._splats.sh), self._exchange.touched()
+        by_sh = torch.zeros_like(self._splats.sh0), torch.zeros_like(self._splats.sh_rest)
+        touched = self._exchange.touched()
         colors_backward(self._splats, self._camera, touched, color[touched], by_sh, means)
-        standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities, sh=by_sh)
+        standard: dict[str, Any] = dict(means=means, quats=quats, scales=scales, opacities=opacities)
+        standard |= dict(zip(STANDARD[4:], by_sh, strict=True))
         return Gradients(**standard, signal=signal, chosen=more[0] if more else None)
 
     def _sums(self, total: Maps, chosen: Maps | None, absolute: bool) -> list[Tensor]:
         """(N, ...) gradients by what the strips were sent, and the signals; what leads to them is freed."""
         here = self._drawn.backward(total, chosen, absolute)
-        parts = [*here.tensors().values(), here.signal, *([] if here.chosen is None else [here.chosen])]
+        parts = [*list(here.tensors().values())[:5], here.signal, *([] if here.chosen is None else [here.chosen])]
         del here
         return [self._exchange.returned(parts.pop(0)) for _ in range(len(parts))]
 

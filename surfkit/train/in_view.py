@@ -64,7 +64,9 @@ class PointsInView:
         return cls.of(setup.primitive, state.points.params, camera, setup.rasterizer, stage.near, blocks)
 
     def of_columns(self, columns: Columns) -> Columns:
-        """(R, ...) of each of (N, ...)."""
+        """(R, ...) of each of (N, ...); the columns themselves where all points are in view."""
+        if len(self.rows) == self.count:
+            return columns
         return {name: value.index_select(0, self.rows) for name, value in columns.items()}
 
     def among_all(self, values: Tensor) -> Tensor:

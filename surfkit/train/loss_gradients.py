@@ -140,9 +140,8 @@ def pulled(
 ) -> Columns:
     """Gradients by the raw parameters, (N, ...) each, from those by the splats and from terms on the splats, scalars.
 
-    A parameter without influence is left out. Of one that is a part of a larger tensor of the splats, such as the first
-    of the harmonics, the gradient may be a part of that tensor's, whose rows do not follow each other. `again` keeps
-    the graph, to pull other gradients.
+    A parameter without influence is left out. Of one that is a part of a larger tensor of the splats the gradient may
+    be a part of that tensor's, whose rows do not follow each other. `again` keeps the graph, to pull other gradients.
     """
     splats, grads = shape.named(), gradients.named()
     names = [name for name, value in splats.items() if value.requires_grad and name in grads]

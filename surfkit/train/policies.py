@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import torch
@@ -87,11 +86,11 @@ def compared_view(setup: StageSetup, state: StageState, result: StepResult) -> C
         if target.mask is not None:
             values = values * target.mask
         count, camera, splats = len(result.shape), target.view.camera, result.splats
-        grey = replace(splats, sh=torch.zeros_like(splats.sh[:, :1]))
+        grey = splats.with_colors(torch.zeros_like(splats.sh0))
         render = setup.rasterizer.render(grey, camera, setup.stage.near, geometry=False, distortion=False)
         cotangent = torch.zeros_like(color)
         cotangent[0] = values
-        by_color = render.backward(Maps(color=cotangent), rows=count).sh[:, 0, 0] / SH_C0
+        by_color = render.backward(Maps(color=cotangent), rows=count).sh0[:, 0, 0] / SH_C0
         return by_color.to(state.points.device)
 
     return ComparedView(color, photo, blended)

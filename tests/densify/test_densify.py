@@ -47,7 +47,9 @@ def compared() -> ComparedView:
 
 
 def step(index: int, **other) -> Step:
-    splats = Splats("surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, None)
+    splats = Splats(
+        "surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, torch.zeros(N, 1, 3)
+    )
     facts = dict(
         index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), splats=splats,
         grad_norm=torch.full((N,), 1e-3), signed_norm=torch.full((N,), 1e-3),

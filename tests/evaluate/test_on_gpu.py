@@ -50,8 +50,8 @@ def made(sight):
         "quats": discs.quats,
         "scales": discs.scales.log(),
         "opacities": discs.opacities.logit(),
-        "sh0": discs.sh,
-        "sh_rest": discs.sh.new_zeros(len(discs), 0, 3),
+        "sh0": discs.sh0,
+        "sh_rest": discs.sh_rest,
     }
     assert params.keys() == primitive.columns().keys()
     return Reconstruction(splats=SplatModel(primitive, params, 0, sight.near))

@@ -64,6 +64,7 @@ def test_shape_uses_the_harmonics_in_use_and_carries_their_gradient(primitive, d
     splats = primitive.activate(params, degree)
     assert splats.sh.shape == (5, (degree + 1) ** 2, 3)
     assert torch.equal(splats.sh[:, 1:], params["sh_rest"][:, : (degree + 1) ** 2 - 1])
+    assert degree == 0 or splats.sh_rest.data_ptr() == params["sh_rest"].data_ptr(), "most of a point was copied"
     sum(value.sum() for value in splats.tensors().values()).backward()
     assert torch.allclose(params["scales"].grad, params["scales"].detach().exp())
     assert torch.allclose(params["opacities"].grad, torch.tensor(0.09))

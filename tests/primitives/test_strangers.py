@@ -58,7 +58,8 @@ class Balls(Primitive):
         means = params["means"]
         quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
         scales = params["scales"].exp().expand(-1, 3)
-        return Splats("gaussian", means, quats, scales, params["opacities"].sigmoid(), harmonics(params, degree))
+        colors = params["sh0"], harmonics(params, degree)
+        return Splats("gaussian", means, quats, scales, params["opacities"].sigmoid(), *colors)
 
 
 DENSITY = Activation(lambda raw: 1 - torch.exp(-torch.exp(raw)), lambda value: torch.log(-torch.log1p(-value)))
@@ -78,8 +79,8 @@ class Fog(Primitive):
 
     def activate(self, params, degree):
         opacities = DENSITY.value(params["opacities"])
-        parts = params["means"], params["quats"], params["scales"].exp(), opacities, harmonics(params, degree)
-        return Splats("surfel", *parts)
+        parts = params["means"], params["quats"], params["scales"].exp(), opacities
+        return Splats("surfel", *parts, params["sh0"], harmonics(params, degree))
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,8 @@ def across(precision: np.ndarray, camera: Camera, x: float, y: float) -> np.ndar
 
 def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
     """The splats that are drawn, front to back."""
-    means, quats, scales, opacities, sh = (t.detach().double().numpy() for t in splats.tensors().values())
+    means, quats, scales, opacities, *sh = (t.detach().double().numpy() for t in splats.tensors().values())
+    sh = np.concatenate(sh, 1)
     pose = camera.world_to_camera.numpy()
     eye = -pose[:3, :3].T @ pose[:3, 3]
     found = []

@@ -51,7 +51,8 @@ def splats(draw: Draw, view: Camera, kind: str, degree: int, **given: Tensor) ->
         quats = draw.normal(count, 4)
     means = (centres - pose[:3, 3]) @ pose[:3, :3]
     sh = 0.4 * draw.normal(count, (degree + 1) ** 2, 3)
-    return Splats(kind, *(t.float() for t in (means, quats, given["scales"], given["opacities"], sh)))
+    parts = means, quats, given["scales"], given["opacities"], sh[:, :1], sh[:, 1:]
+    return Splats(kind, *(t.float() for t in parts))
 
 
 def _box(draw: Draw, count: int, z_low: float = 1.0, z_high: float = 2.5) -> Tensor:

@@ -43,7 +43,8 @@ def splats(kind, count, size, geometry):
     means = torch.cat([xy, torch.full((count, 1), 2.0)], 1)
     scales = torch.full((count, 2 if kind == "surfel" else 3), size * 2.0 / SIDE)
     given = means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), scales, torch.full((count,), 0.02)
-    return Splats(kind, *given, torch.rand(count, 4, 3, generator=draw), geometry=geometry)
+    sh = torch.rand(count, 4, 3, generator=draw)
+    return Splats(kind, *given, sh[:, :1], sh[:, 1:], geometry=geometry)
 
 
 def taken(kind, count, size, chosen, geometry="axis"):

@@ -326,7 +326,7 @@ def test_what_only_grazes_the_image_is_seen(kind):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [("scales", float("nan"), "not finite"), ("means", float("inf"), "not finite"), ("scales", -1.0, "not positive"),
-     ("quats", 0.0, "zero"), ("opacities", float("nan"), "not finite"), ("sh", float("nan"), "not finite")],
+     ("quats", 0.0, "zero"), ("opacities", float("nan"), "not finite"), ("sh0", float("nan"), "not finite")],
 )  # fmt: skip
 def test_bad_values_are_refused_with_their_row(kind, name, value, words):
     shown, view = make("plain", kind)

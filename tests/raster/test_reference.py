@@ -223,11 +223,11 @@ def test_gradcheck_of_every_map_for_every_parameter(kind, antialias, geometry):
 def test_gradcheck_of_the_colour_of_degree_3():
     shown, view = few("surfel", 3)
 
-    def seen(means, sh):
-        return colors(Splats("surfel", means, shown.quats, shown.scales, shown.opacities, sh), view)
+    def seen(means, *sh):
+        return colors(Splats("surfel", means, shown.quats, shown.scales, shown.opacities, *sh), view)
 
     tensors = leaves(shown).tensors()
-    assert torch.autograd.gradcheck(seen, (tensors["means"], tensors["sh"]))
+    assert torch.autograd.gradcheck(seen, (tensors["means"], tensors["sh0"], tensors["sh_rest"]))
 
 
 def test_gradients_of_the_low_pass_filter():

@@ -16,7 +16,7 @@ NAN, INF = float("nan"), float("inf")
 
 def spoilt(kind: str, name: str, row: int, value: float):
     """A scene with one row of one tensor set to a value."""
-    shown, view = make("plain", kind)
+    shown, view = make("plain", kind, 1)
     tensor = getattr(shown, name).clone()
     tensor[row] = value
     return replace(shown, **{name: tensor}), view
@@ -33,7 +33,8 @@ def spoilt(kind: str, name: str, row: int, value: float):
         ("quats", NAN, "not finite"),
         ("means", INF, "not finite"),
         ("opacities", NAN, "not finite"),
-        ("sh", INF, "not finite"),
+        ("sh0", INF, "not finite"),
+        ("sh_rest", INF, "not finite"),
     ],
 )
 def test_bad_values_are_named_with_their_row(kind, name, value, words):
@@ -52,8 +53,9 @@ def test_bad_values_are_named_with_their_row(kind, name, value, words):
         ("quats", (69, 4), r"\(70, 4\)"),
         ("scales", (70, 3), r"\(70, 2\)"),
         ("opacities", (70, 1), r"\(70,\)"),
-        ("sh", (70, 5, 3), r"\(70, 1, 4, 9 or 16, 3\)"),
-        ("sh", (70, 4), r"\(70, 1, 4, 9 or 16, 3\)"),
+        ("sh0", (70, 3), r"\(70, 1, 3\)"),
+        ("sh_rest", (70, 4, 3), r"\(70, 0, 3, 8 or 15, 3\)"),
+        ("sh_rest", (70, 3), r"\(70, 0, 3, 8 or 15, 3\)"),
     ],
 )
 def test_wrong_shapes_are_named(name, shape, wanted):

@@ -38,7 +38,7 @@ def weights(splats, camera, near):
         sh = black.clone()
         sh[k] = 0.5 / SH_C0
         with torch.no_grad():
-            found.append(draw(replace(splats, sh=sh), camera, near).maps.color[0])
+            found.append(draw(splats.with_colors(sh), camera, near).maps.color[0])
     return torch.stack(found)
 
 

@@ -34,7 +34,7 @@ def grown(begin, truth, filters) -> list[tuple[int, int]]:
     params = {name: value[: int(left.sum()) + NEEDLES].clone() for name, value in state.points.params.items()}
     raw = {
         "means": discs.means, "quats": discs.quats, "scales": discs.scales.log(),
-        "opacities": discs.opacities.logit(), "sh0": discs.sh,
+        "opacities": discs.opacities.logit(), "sh0": discs.sh0,
     }  # fmt: skip
     for name, value in raw.items():
         params[name][:-NEEDLES] = value

@@ -119,6 +119,14 @@ class Sums(Prune):
         return None
 
 
+def test_points_that_are_all_in_view_are_not_copied():
+    columns = {"means": torch.rand(4, 3), "opacities": torch.rand(4)}
+    found = PointsInView(torch.arange(4), 4).of_columns(columns)
+    assert all(found[name].data_ptr() == value.data_ptr() for name, value in columns.items())
+    some = PointsInView(torch.tensor([1, 3]), 4).of_columns(columns)
+    assert torch.equal(some["means"], columns["means"][[1, 3]])
+
+
 @pytest.mark.parametrize("optimizer", [Adam(), AdamInView()], ids=["all", "in view"])
 def test_statistics_of_what_is_shown_are_those_of_all(apart, optimizer):
     trainer, state = apart(replace(QUIET, optimizer=optimizer, prune=(Sums(),)))

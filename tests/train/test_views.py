@@ -38,7 +38,7 @@ def test_contribution_is_the_mean_over_views_of_means_over_pixels():
     from surfkit.raster.api import Splats
     from surfkit.scene.scene import View
 
-    splats = Splats("surfel", *[None] * 3, torch.ones(3), None)
+    splats = Splats("surfel", *[None] * 3, torch.ones(3), torch.zeros(3, 1, 3))
     contributions = ViewContributions([View("a", 4.0, None), View("b", 8.0, None)], Fixed(), splats, 0.005)
     tally = contributions.contributions(0.25, 0.75)
     assert tally.mean.tolist() == [2, 0, 3] and tally.peak.tolist() == [2, 0, 4] and len(contributions) == 2

@@ -162,7 +162,7 @@ def ball(**changes):
     given = mesh_input("gaussian", count=3000, views=6)
     colors = (texture(2 * given.splats.means.T.double()).T.float() - 0.5) / 0.2821
     scales = given.splats.scales * 0.6
-    splats = replace(given.splats, sh=colors[:, None].contiguous(), scales=scales)
+    splats = replace(given.splats, sh0=colors[:, None].contiguous(), scales=scales)
 
     def draw(view: View) -> Maps:
         return given.rasterizer.render(splats, view.camera, 0.01, True, False).maps

@@ -126,7 +126,7 @@ class PlaneRender(Render):
 
         def with_distances(given: Splats) -> tuple[Splats, Tensor]:
             color = (plane_distances(given, camera)[:, None, None] - 0.5) / SH_C0
-            return replace(given, sh=color.expand(-1, -1, 3)), torch.arange(len(given), device=color.device)
+            return given.with_colors(color.expand(-1, -1, 3)), torch.arange(len(given), device=color.device)
 
         self._camera = camera
         self._all = rasterizer.render(splats, camera, near, True, distortion)

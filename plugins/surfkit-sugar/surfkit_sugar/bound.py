@@ -176,7 +176,7 @@ class BoundMesh(Mesher):
         """See `Mesher.mesh`; vertices have the mean colour of the splats around them."""
         vertices, faces, _ = mesh_of(subject.splats, "mesh:bound")
         splats = subject.splats
-        colors = (0.5 + SH_C0 * splats.sh[:, 0]).clamp(0, 1)
+        colors = (0.5 + SH_C0 * splats.sh0[:, 0]).clamp(0, 1)
         rows, weights = (splats.extra[name] for name in ("corners", "weights"))
         total = colors.new_zeros(len(vertices), 4)
         for at in range(3):

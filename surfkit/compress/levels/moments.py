@@ -181,5 +181,5 @@ def one_thread() -> Iterator[None]:
 def alike(splats: Splats, weights: np.ndarray) -> MergeCost:
     """What tells which splats are alike; `weights`: (N,) of them."""
     shapes = Shapes.of(splats)
-    colors = 0.5 + SH_C0 * splats.sh[:, 0].detach().double().cpu().numpy()
+    colors = 0.5 + SH_C0 * splats.sh0[:, 0].detach().double().cpu().numpy()
     return MergeCost(shapes.means, weights, colors, shapes.normals)

@@ -235,7 +235,8 @@ class SplatTree(LodTree):
                 "quats": torch.lerp(quats, own, share[:, None]),
                 "scales": torch.lerp(scales, node.scales, share[:, None]),
                 "opacities": torch.lerp(parent.opacities * heir, node.opacities, share),
-                "sh": torch.lerp(parent.sh, node.sh, share[:, None, None]),
+                "sh0": torch.lerp(parent.sh0, node.sh0, share[:, None, None]),
+                "sh_rest": torch.lerp(parent.sh_rest, node.sh_rest, share[:, None, None]),
             }
         )
 

@@ -37,12 +37,19 @@ Planes planes(const std::vector<Optional>& maps) {  // in the order of api.Maps
 
 SplatArrays arrays(const std::vector<Array>& s) {  // in the order of api.Splats.tensors
     return {(int64_t)s.at(0).shape(0),
-            s.at(4).ndim() == 2 ? 0 : (int)s.at(4).shape(1),
+            s.at(4).ndim() == 2 ? 0 : 1 + (int)s.at(5).shape(1),
             s[0].data(),
             s[1].data(),
             s[2].data(),
             s[3].data(),
-            s[4].data()};
+            s[4].data(),
+            s[5].data()};
+}
+
+// Of colours alone: means and the two arrays of coefficients.
+SplatArrays shaded(const std::vector<Array>& s) {
+    return {(int64_t)s.at(0).shape(0), 1 + (int)s.at(2).shape(1), s[0].data(), nullptr, nullptr, nullptr,
+            s[1].data(), s[2].data()};
 }
 
 Kind kind_of(bool surfel, splat::Geometry geometry) {
@@ -115,7 +122,7 @@ void add_raster(nb::module_& m) {
                 const auto s = arrays(splats);
                 const Planes t = planes(total), c = chosen.empty() ? Planes{} : planes(chosen);
                 const GradientArrays g{out.at(0).data(), out.at(1).data(), out.at(2).data(),   out.at(3).data(),
-                                       out.at(4).data(), signal.data(),    data(chosen_signal)};
+                                       out.at(4).data(), out.at(5).data(), signal.data(),    data(chosen_signal)};
                 const bool part = !chosen.empty();
                 nb::gil_scoped_release free;
                 self.backward(s, t, part ? &c : nullptr, absolute, rows, g, threads);
@@ -135,25 +142,26 @@ void add_raster(nb::module_& m) {
     m.def("in_view", [](bool surfel, int geometry, Array means, Array scales, std::vector<double> pose,
                         std::vector<double> lens, int width, int height, double near, Flags found, int threads,
                         int first_row, int end_row) {
-        const SplatArrays s{(int64_t)means.shape(0), 0, means.data(), nullptr, scales.data(), nullptr, nullptr};
+        const SplatArrays s{(int64_t)means.shape(0), 0, means.data(), nullptr, scales.data()};
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
         in_view(kind_of(surfel, (splat::Geometry)geometry), s, c, {first_row, end_row}, threads, found.data());
     });
-    m.def("shade", [](Array means, Array sh, Counts rows, std::vector<double> pose, std::vector<double> lens, int width,
-                      int height, double near, Array rgb, int threads) {
-        const SplatArrays s{(int64_t)means.shape(0), (int)sh.shape(1), means.data(), nullptr, nullptr, nullptr, sh.data()};
+    m.def("shade", [](std::vector<Array> shading, Counts rows, std::vector<double> pose, std::vector<double> lens,
+                      int width, int height, double near, Array rgb, int threads) {
+        const SplatArrays s = shaded(shading);
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
         shade(s, rows.data(), (int64_t)rows.size(), c, threads, rgb.data());
     });
-    m.def("shade_backward", [](Array means, Array sh, Counts rows, std::vector<double> pose, std::vector<double> lens,
-                               int width, int height, double near, Array by_rgb, Array by_sh, Array by_means,
-                               int threads) {
-        const SplatArrays s{(int64_t)means.shape(0), (int)sh.shape(1), means.data(), nullptr, nullptr, nullptr, sh.data()};
+    m.def("shade_backward", [](std::vector<Array> shading, Counts rows, std::vector<double> pose, std::vector<double> lens,
+                               int width, int height, double near, Array by_rgb, Array by_sh0, Array by_sh_rest,
+                               Array by_means, int threads) {
+        const SplatArrays s = shaded(shading);
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
-        shade_backward(s, rows.data(), (int64_t)rows.size(), c, threads, by_rgb.data(), by_sh.data(), by_means.data());
+        shade_backward(s, rows.data(), (int64_t)rows.size(), c, threads, by_rgb.data(), by_sh0.data(),
+                       by_sh_rest.data(), by_means.data());
     });
     m.def(
         "kernels",
@@ -172,7 +180,7 @@ void add_raster(nb::module_& m) {
     m.def("ray_opacity", [](std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens, int width,
                             int height, double near, Points points, Array opacity, int threads) {
         const SplatArrays s{(int64_t)splats.at(0).shape(0), 0,       splats[0].data(), splats.at(1).data(),
-                            splats.at(2).data(),            splats.at(3).data(), nullptr};
+                            splats.at(2).data(),            splats.at(3).data()};
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
         ray_opacity(s, c, points.data(), (int64_t)points.shape(0), opacity.data(), threads);

@@ -32,7 +32,8 @@ struct Saved {
 struct SplatArrays {
     int64_t count;
     int coefficients;  // of spherical harmonics, per channel
-    const float *means, *quats, *scales, *opacities, *sh;
+    const float *means, *quats, *scales, *opacities;
+    const float *sh0, *sh_rest;  // the first coefficient, and the others
 };
 
 struct Job {
@@ -99,12 +100,12 @@ struct Kernels {
     // Writes the tiles that a bound touches (`each_tile`), at most tiles_x * tiles_y; their number.
     int (*tiles)(const splat::Bound<double>&, int tiles_x, int tiles_y, double rim, uint32_t* to);
     // Colours of the splats of some rows, below 0 too. And the gradients of their coefficients (1, 4, 9 or 16 of them),
-    // in the layout of `sh`, and what is added to those of their means, from `rgb`, the sums over their pixels, `stride`
-    // numbers apart.
+    // and what is added to those of their means, from `rgb`, the sums over their pixels, `stride` numbers apart.
     void (*shade)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
                   double (*rgb)[3]);
     void (*shade_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
-                           const double* rgb, int stride, float* out_sh, splat::SplatGrad<double>* out);
+                           const double* rgb, int stride, float* out_sh0, float* out_sh_rest,
+                           splat::SplatGrad<double>* out);
     // Adds up those of `count` rows of `width` numbers, a multiple of 4, that are touched; whether one is.
     bool (*add_rows)(const float* rows, const uint8_t* touched, int64_t count, int width, double* sums);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,

@@ -153,7 +153,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
                 kernel.shade(splats, index_.get() + first, at - first, camera_, rgb);
             } else {
                 for (int64_t r = first; r < at; r++)
-                    for (int q = 0; q < 3; q++) rgb[r - first][q] = splats.sh[3 * index_[r] + q];
+                    for (int q = 0; q < 3; q++) rgb[r - first][q] = splats.sh0[3 * index_[r] + q];
             }
             for (int64_t r = first; r < at; r++) {
                 const double* look = rgb[r - first];
@@ -326,11 +326,11 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         SplatGrad<double> gradients[kGroup];
         gradients_of(kind_, splats, rows, hit, camera_, form_, all, width, gradients);
         if (splats.coefficients) {
-            k.shade_backward(splats, rows, hit, camera_, all + color_at, width, out.sh, gradients);
+            k.shade_backward(splats, rows, hit, camera_, all + color_at, width, out.sh0, out.sh_rest, gradients);
         } else {
             for (int64_t h = 0; h < hit; h++)
                 for (int64_t q = 0, i = 3 * rows[h]; q < 3; q++)
-                    out.sh[i + q] = splats.sh[i + q] > 0 ? (float)all[h * width + color_at + q] : 0.0f;
+                    out.sh0[i + q] = splats.sh0[i + q] > 0 ? (float)all[h * width + color_at + q] : 0.0f;
         }
         for (int64_t h = 0; h < hit; h++) {
             const int64_t i = rows[h];
@@ -355,7 +355,8 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         zero(out.quats, 4);
         zero(out.scales, columns);
         zero(out.opacities, 1);
-        zero(out.sh, 3 * std::max(1, splats.coefficients));
+        zero(out.sh0, 3);
+        zero(out.sh_rest, 3 * std::max(0, splats.coefficients - 1));
         zero(out.signal, 2);
         zero(out.chosen, 2);
     };
@@ -458,15 +459,15 @@ void shade(const SplatArrays& splats, const int64_t* rows, int64_t count, const 
 }
 
 void shade_backward(const SplatArrays& splats, const int64_t* rows, int64_t count,
-                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh,
-                    float* by_means) {
+                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh0,
+                    float* by_sh_rest, float* by_means) {
     parallel(chunks_of(count, kChunk), threads, [&](int64_t c) {
         const int64_t from = c * kChunk, some = std::min(kChunk, count - from);
         double given[kChunk][3];
         std::vector<SplatGrad<double>> gradients(some);  // zeros
         for (int64_t k = 0; k < some; k++)
             for (int q = 0; q < 3; q++) given[k][q] = by_rgb[3 * (from + k) + q];
-        kernels().shade_backward(splats, rows + from, some, camera, given[0], 3, by_sh, gradients.data());
+        kernels().shade_backward(splats, rows + from, some, camera, given[0], 3, by_sh0, by_sh_rest, gradients.data());
         for (int64_t k = 0; k < some; k++) {
             float* to = by_means + 3 * rows[from + k];
             to[0] = (float)(to[0] + gradients[k].mean.x);

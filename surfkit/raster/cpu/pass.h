@@ -12,7 +12,7 @@
 namespace surfkit {
 
 struct GradientArrays {
-    float *means, *quats, *scales, *opacities, *sh, *signal, *chosen;  // chosen may be null
+    float *means, *quats, *scales, *opacities, *sh0, *sh_rest, *signal, *chosen;  // chosen may be null
 };
 
 // Rows of tiles [first, end) of an image, those that one process of several draws.
@@ -25,7 +25,7 @@ class Pass {
   public:
     // Projects and bins. `seen` and `radii` are written for every splat. `rim`: 0.5 if pixel centres are to be drawn, 0
     // if anything between them. Outside the `strip` nothing is drawn, and its pixels get the bits of the whole image.
-    // Splats of 0 coefficients have colours in the place of `sh`, as `shade` gives them.
+    // Splats of 0 coefficients have colours in the place of `sh0`, as `shade` gives them.
     Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, const GaussianForm& form,
          double rim, int threads, bool* seen, float* radii, Strip strip = kWholeImage);
 
@@ -82,12 +82,12 @@ void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<doub
              bool* found);
 
 // Colours (count, 3) of the splats of some rows, below 0 too. And the other way: from gradients by them, (count, 3), to
-// those by the coefficients of these rows, in the layout of `sh`, and to what is added to those of all means, (N, 3).
+// those by the coefficients of these rows, and to what is added to those of all means, (N, 3).
 void shade(const SplatArrays& splats, const int64_t* rows, int64_t count, const splat::CameraModel<double>& camera,
            int threads, float* rgb);
 void shade_backward(const SplatArrays& splats, const int64_t* rows, int64_t count,
-                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh,
-                    float* by_means);
+                    const splat::CameraModel<double>& camera, int threads, const float* by_rgb, float* by_sh0,
+                    float* by_sh_rest, float* by_means);
 
 // The compilation in use, and those that this machine can run (best first).
 const Kernels& kernels();

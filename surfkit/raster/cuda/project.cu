@@ -34,7 +34,7 @@ measure(Buffer<const float> means, Buffer<const float> quats, Buffer<const float
         View view, Buffer<int> tiles, Buffer<float> depth, Buffer<float> radii, Buffer<long long> invalid) {
     const long long i = blockIdx.x * 128LL + threadIdx.x;
     if (i >= tiles.size) return;
-    const Arrays splats = {means, quats, scales, opacities, opacities};
+    const Arrays splats = {means, quats, scales, opacities, {}, {}};
     const SplatIn<Pair> in = read_splat(splats, i, kColumns);
     int count = 0;
     float z = 0, radius = 0;
@@ -60,11 +60,12 @@ measure(Buffer<const float> means, Buffer<const float> quats, Buffer<const float
 // on.
 KERNEL(128)
 record(Buffer<const float> means, Buffer<const float> quats, Buffer<const float> scales, Buffer<const float> opacities,
-       Buffer<const float> sh, View view, Buffer<const long long> index, Buffer<const int> first,
-       Buffer<SplatRecord> records, Buffer<SplatTint> tints, Buffer<TileNumber> tile_of, Buffer<int> record_of) {
+       Buffer<const float> sh0, Buffer<const float> sh_rest, View view, Buffer<const long long> index,
+       Buffer<const int> first, Buffer<SplatRecord> records, Buffer<SplatTint> tints, Buffer<TileNumber> tile_of,
+       Buffer<int> record_of) {
     const long long r = blockIdx.x * 128LL + threadIdx.x;
     if (r >= index.size) return;
-    const Arrays splats = {means, quats, scales, opacities, sh};
+    const Arrays splats = {means, quats, scales, opacities, sh0, sh_rest};
     const long long i = index[r];
     const SplatIn<Pair> in = read_splat(splats, i, kColumns);
     SplatRecord o;

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -93,7 +92,7 @@ class RasterPass:
     """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn.
 
     Attributes:
-        arrays: The five tensors of the splats.
+        arrays: The standard tensors of the splats.
         seen, radii: As in `Render`.
         index: (M,) int64, the splat of each record: those seen, by depth.
         first: (M + 1,) int32, the first slot of each record; a slot is a pair of a splat and a tile.
@@ -117,7 +116,7 @@ class RasterPass:
         self.program = partial(program, KIND=self.kind)  # which knows nothing of this pass: its tensors go with it
         self.device, self.home, self.view = device, splats.means.device, _view(splats, camera, near, rim)
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
-        self.coefficients = self.arrays[4].shape[1]
+        self.coefficients = 1 + self.arrays[5].shape[1]
         self.tiles = self.view.tiles[0] * self.view.tiles[1]
         self.tile_bytes = 2 if self.tiles < 2**15 else 4  # a sort takes a pass for each
         defines = {"COEFFICIENTS": self.coefficients, "TILE_BYTES": self.tile_bytes}
@@ -238,8 +237,7 @@ class CudaRender(Render):
         part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
         program = {"CHOSEN": int(chosen is not None), "WIDTH": width, "COEFFICIENTS": drawn.coefficients}
         gather = drawn.program("gather", LEVEL=LEVEL_COLOR, **program)
-        harmonics = arrays[4][:0] if len(drawn.tints) else arrays[4]
-        given = *arrays[:4], harmonics, drawn.view, drawn.tints, drawn.index, drawn.first, sums, touched, rows
+        given = *arrays, drawn.view, drawn.tints, drawn.index, drawn.first, sums, touched, rows
         gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
         home = drawn.home
         standard: dict[str, Any] = {name: grad.to(home) for name, grad in zip(STANDARD, grads, strict=True)}
@@ -339,7 +337,7 @@ def _upload(tensor: Tensor, device: torch.device) -> Tensor:
 
 def _grey(splats: Splats) -> Splats:
     """The same without colours, which cost a third of the projection."""
-    return replace(splats, sh=splats.sh.new_zeros(len(splats), 1, 3))
+    return splats.with_colors(splats.sh0.new_zeros(len(splats), 1, 3))
 
 
 def _raw(name: str, size: int) -> type[ctypes.Structure]:

@@ -38,7 +38,7 @@ inline Vec<float> rounded(Vec<Pair> v) { return {(float)v.x, (float)v.y, (float)
 #ifdef COEFFICIENTS
 // Activated values of splats, as in raster/api.py.
 struct Arrays {
-    Buffer<const float> means, quats, scales, opacities, sh;
+    Buffer<const float> means, quats, scales, opacities, sh0, sh_rest;
     static constexpr int coefficients = COEFFICIENTS;
 };
 typedef splat::Sight<float> Sight;

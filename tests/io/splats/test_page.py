@@ -318,8 +318,8 @@ def test_the_page_draws_what_the_rasterizer_draws(tmp_path, kind, shown):
     camera = Camera(pose, 90.0, 90.0, 60.0, 45.0, 120, 90)
     views = [View("a", camera, tmp_path / "a.png")]
     HtmlPageFormat().write_seen(tmp_path / "a.html", table, Frame(np.zeros(3), 1.0), views, None)
-    sh = torch.cat([table.sh0[:, None], table.sh_rest], 1)
-    splats = Splats(kind, means, table.quats, scales.exp(), table.opacity_logits.sigmoid(), sh)
+    opacities = table.opacity_logits.sigmoid()
+    splats = Splats(kind, means, table.quats, scales.exp(), opacities, table.sh0[:, None], table.sh_rest)
     expected = draw(splats, camera, 1e-3).maps.color.clamp(0, 1).permute(1, 2, 0).double().numpy()
     off = shown(tmp_path / "a.html", 120, 90) - expected
     assert expected.std() > 0.1 and 10 * np.log10(1 / (off**2).mean()) > 42

@@ -28,5 +28,6 @@ class Balls(Primitive):
             quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
             scales=params["scales"].exp().repeat(1, 3),
             opacities=SIGMOID.value(params["opacities"]),
-            sh=harmonics(params, degree),
+            sh0=params["sh0"],
+            sh_rest=harmonics(params, degree),
         )

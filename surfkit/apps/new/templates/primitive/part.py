@@ -45,7 +45,8 @@ class NewPart(Primitive):
             quats=means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(means), 1),
             scales=params["scales"].exp().repeat(1, 3),
             opacities=SIGMOID.value(params["opacities"]),
-            sh=harmonics(params, degree),
+            sh0=params["sh0"],
+            sh_rest=harmonics(params, degree),
         )
 
     def from_table(self, table: SplatTable, generator: torch.Generator) -> Columns:
