@@ -184,7 +184,7 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
         whole = f"about {duration(told.seconds)} for the steps of optimisation; {later} come on top"
         if told.other_seconds is not None:
             whole = f"about {duration(told.seconds + told.other_seconds)}: {duration(told.seconds)} for the steps of "
-            whole += f"optimisation, as measured, and {duration(told.other_seconds)}, within a factor of 3, for {later}"
+            whole += f"optimisation, as measured, and {duration(told.other_seconds)} for {later}, within a factor of 3"
         found.append(("time", whole))
         mesh = "may take more" if told.mesh_bytes is None else f"takes {size(told.mesh_bytes)} beside the points"
         found.append(("memory", f"{size(told.memory_bytes)} for the optimisation; making the mesh {mesh}"))
