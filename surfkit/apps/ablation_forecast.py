@@ -74,13 +74,15 @@ def lines(plan: AblationPlan, name: str, needs: Needs, recipe: Recipe, found: Re
     aside += found.mesh.seconds if found.mesh is not None else 0.0
     seconds = needs.steps * each + needs.runs * aside + found.depth_seconds  # depth maps are made once
     disk = max(needs.runs, needs.stages) * found.run_bytes
-    free, meshes = found.room.run_bytes, "without meshes" if found.mesh is None else "with meshes"
+    free = found.room.run_bytes
+    maps, meshes = found.depth_seconds > 0, found.mesh is not None
+    included = f"with {'depth maps and ' * maps}meshes" if meshes else f"{'with depth maps, ' * maps}without meshes"
     less = f", {needs.alone - needs.steps:,} fewer as rows share stages" if needs.alone > needs.steps else ""
     at_once = plan.workers.at_once or 1
     shared_by = f" of computing, {at_once} rows at a time" if at_once > 1 else ""
     yield (
         f"{name}: {needs.runs} runs, {needs.steps:,} optimisation steps{less}; about {duration(seconds)}{shared_by} "
-        f"at {1000 * each:.0f} ms a step, {meshes}; about {size(disk)} of disk, {size(free)} are free"
+        f"{included}, at {1000 * each:.0f} ms a step; about {size(disk)} of disk, {size(free)} are free"
     )
     if needs.others:
         yield f"{name}: not included: {needs.others} runs of methods that do not optimise splats"

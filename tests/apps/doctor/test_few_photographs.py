@@ -78,7 +78,7 @@ def test_depth_maps_and_points_at_the_start_are_those_of_the_run(name, tmp_path,
     run(recipe, data, tmp_path / "run", intervals=Intervals(pictures=0))
     assert found.depth_seconds == pytest.approx(clock.now, rel=0.1)
     count = len(begun[0].xyz)
-    assert found.points is not None and count / 1.5 < found.points < 1.5 * count
+    assert found.points is not None and count / 1.25 < found.points < 1.25 * count
     limited = replace(recipe, start=replace(recipe.start, most=100))
     assert told(data, limited, tmp_path / "limited").points == 100
 
