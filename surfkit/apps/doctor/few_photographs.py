@@ -47,7 +47,7 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, SparsePoints, View
 from surfkit.start.base import StartInput
 
-FEW = 12
+LOOKED_AT_PHOTOS = 12
 """Photographs that are looked at: one in the middle, and those that show most of what it shows."""
 LONGEST_PX = 320
 """Longest side at which they are used: the time is that of the pixels."""
@@ -140,7 +140,7 @@ def few_of(data: Data, examined: ExaminedData, folder: Path) -> Few | None:
     in_middle = np.zeros(len(tracks.xyz), bool)
     in_middle[shown[len(views) // 2]] = True
     shared = np.array([in_middle[points].sum() for points in shown])
-    chosen = sorted(np.argsort(-shared, kind="stable")[:FEW].tolist())
+    chosen = sorted(np.argsort(-shared, kind="stable")[:LOOKED_AT_PHOTOS].tolist())
     own = np.unique(np.concatenate([shown[at] for at in chosen]))
     if not len(own):
         return None
