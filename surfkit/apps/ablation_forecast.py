@@ -71,14 +71,18 @@ def lines(plan: AblationPlan, name: str, needs: Needs, recipe: Recipe, found: Re
     """
     each = sum(found.step_seconds) / len(found.step_seconds)
     aside = max(0.0, found.seconds - each * recipe.pretrain.steps)  # reading, saving, measuring
-    seconds, disk = needs.steps * each + needs.runs * aside, max(needs.runs, needs.stages) * found.run_bytes
+    aside += found.mesh.seconds if found.mesh is not None else 0.0
+    seconds = needs.steps * each + needs.runs * aside + found.depth_seconds  # depth maps are made once
+    disk = max(needs.runs, needs.stages) * found.run_bytes
     free = found.room.run_bytes
+    maps, meshes = found.depth_seconds > 0, found.mesh is not None
+    included = f"with {'depth maps and ' * maps}meshes" if meshes else f"{'with depth maps, ' * maps}without meshes"
     less = f", {needs.alone - needs.steps:,} fewer as rows share stages" if needs.alone > needs.steps else ""
     at_once = plan.workers.at_once or 1
     shared_by = f" of computing, {at_once} rows at a time" if at_once > 1 else ""
     yield (
         f"{name}: {needs.runs} runs, {needs.steps:,} optimisation steps{less}; about {duration(seconds)}{shared_by} "
-        f"at {1000 * each:.0f} ms a step, without meshes; about {size(disk)} of disk, {size(free)} are free"
+        f"{included}, at {1000 * each:.0f} ms a step; about {size(disk)} of disk, {size(free)} are free"
     )
     if needs.others:
         yield f"{name}: not included: {needs.others} runs of methods that do not optimise splats"

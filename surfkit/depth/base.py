@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import View
 
@@ -76,6 +77,11 @@ class DepthEstimator(Component):
     def refuse_unfit(self, views: Sequence[View]) -> None:
         """BadInput if the settings do not fit the photographs; asked before anything is written or deleted."""
         return None
+
+    def of_map(self, camera: Camera) -> Camera:
+        """The camera of the depth map of a photograph, from that of the photograph; a map may be smaller. For what is
+        told beforehand: the time of a map is foretold by its pixels."""
+        return camera
 
     def files(self, views: Sequence[View]) -> tuple[Path, ...]:
         """Files that it reads beside the photographs; maps that were made from others are not used again."""

@@ -13,6 +13,7 @@ from torch.nn.functional import interpolate
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.scene.camera import Camera
 from surfkit.scene.photos import read_photo
 
 LICENCES = {"small": "Apache-2.0", "base": "CC BY-NC 4.0", "large": "CC BY-NC 4.0"}
@@ -58,6 +59,10 @@ class DepthAnythingV2(DepthEstimator):
         use = "" if self.size == "small" else ", which forbids commercial use"
         return f"the weights {self.source} are under {LICENCES[self.size]}{use}"
 
+    def of_map(self, camera: Camera) -> Camera:
+        """See `DepthEstimator.of_map`."""
+        return camera.fitted(max(self.given_size(camera.height, camera.width)))
+
     def refuse_missing(self) -> None:
         """See `DepthEstimator.refuse_missing`."""
         self.network()
@@ -93,8 +98,12 @@ class DepthAnythingV2(DepthEstimator):
 
     def inverse_depth(self, network: Any, rgb: Tensor) -> Tensor:
         """(h, w) relative inverse depth of a photograph (3, H, W) in [0, 1]; 0 for what is infinitely far."""
-        by = self.shortest / min(rgb.shape[1:])
-        size = [max(1, round(side * by / PATCH_PX)) * PATCH_PX for side in rgb.shape[1:]]
+        size = self.given_size(*rgb.shape[1:])
         small = interpolate(rgb[None], size, mode="bicubic", antialias=True, align_corners=False)
         mean, spread = (rgb.new_tensor(values).view(3, 1, 1) for values in (CHANNEL_MEANS, CHANNEL_DEVIATIONS))
         return network(pixel_values=(small - mean) / spread).predicted_depth[0].clamp_min(0)
+
+    def given_size(self, height: int, width: int) -> list[int]:
+        """Height and width at which a photograph is given to the network, whole patches."""
+        by = self.shortest / min(height, width)
+        return [max(1, round(side * by / PATCH_PX)) * PATCH_PX for side in (height, width)]

@@ -91,6 +91,10 @@ class Filled(DepthEstimator):
         """See `DepthEstimator`."""
         return 1000 * FILL_VERSION + self.stereo.version
 
+    def of_map(self, camera: Camera) -> Camera:
+        """See `DepthEstimator.of_map`."""
+        return self.stereo.of_map(camera)
+
     def files(self, views: Sequence[View]) -> tuple[Path, ...]:
         """See `DepthEstimator.files`."""
         return (*self.stereo.files(views), *self.fill.files(views))

@@ -159,7 +159,7 @@ class PatchMatch(DepthEstimator):
         refuse_wide_window(self.window, {view.name: self.of_map(view.camera) for view in views})
 
     def of_map(self, camera: Camera) -> Camera:
-        """The camera of the depth map of a photograph, from that of the photograph."""
+        """See `DepthEstimator.of_map`."""
         return camera.fitted(min(self.longest, max(1, round(max(camera.width, camera.height) / self.scale))))
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:

@@ -102,9 +102,13 @@ class PlaneSweep(DepthEstimator):
         if not (0 < self.edge < 1 and self.step_cost <= self.jump_cost):
             raise BadInput("edge must be in (0, 1), and step_cost no more than jump_cost")
 
+    def of_map(self, camera: Camera) -> Camera:
+        """See `DepthEstimator.of_map`."""
+        return camera.fitted(self.longest)
+
     def refuse_unfit(self, views: Sequence[View]) -> None:
         """See `DepthEstimator.refuse_unfit`."""
-        refuse_wide_window(self.window, {view.name: view.camera.fitted(self.longest) for view in views})
+        refuse_wide_window(self.window, {view.name: self.of_map(view.camera) for view in views})
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
@@ -137,7 +141,7 @@ class PlaneSweep(DepthEstimator):
     def picture(self, given: DepthInput, at: int) -> PosedImage:
         """A photograph at the working size."""
         view = given.views[at]
-        camera = view.camera.fitted(self.longest)
+        camera = self.of_map(view.camera)
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels)
         return PosedImage(camera, rgb.to(given.device, torch.float32) / 255)
 

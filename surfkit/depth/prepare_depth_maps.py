@@ -35,6 +35,7 @@ from surfkit.io.datasets.depth_prior import MIN_TRUSTED_CONFIDENCE
 from surfkit.io.datasets.fingerprint import content_of, digest
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
+from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
@@ -294,10 +295,15 @@ def others_warning(root: Path, maps: Iterable[DepthFile], own: DepthEstimator, l
         return None
     parts = [f"with {use}, not with {wanted}"] if use != wanted else []
     parts += [f"with other settings of {wanted} than the recipe has"] if use == wanted and made != dump(own) else []
-    most = getattr(own, "longest", longest)  # estimators may make smaller maps of all photographs
-    if isinstance(side, int) and 0 < min(side, most) < min(longest, most):
+    if isinstance(side, int) and 0 < side and _longest_of_map(own, side) < _longest_of_map(own, longest):
         parts.append(f"from photographs of {side} px, where the run has such of {longest} px")
     return f"{folder} has depth maps, made {' and '.join(parts)}: the run uses these" if parts else None
+
+
+def _longest_of_map(estimator: DepthEstimator, px: int) -> int:
+    """Longest side of a depth map, from that of a photograph; estimators may make smaller maps of all photographs."""
+    made = estimator.of_map(Camera(torch.eye(4, dtype=torch.float64), px, px, px / 2, px / 2, px, px))
+    return max(made.width, made.height)
 
 
 def fault_of(view: View) -> BadInput | None:

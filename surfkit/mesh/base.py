@@ -114,6 +114,11 @@ class Mesher(Component):
         """
         return self.needs_prior
 
+    @property
+    def most_triangles(self) -> int | None:
+        """About how many triangles it gives at most, whatever the scene; None for any number. For a forecast."""
+        return None
+
     def ready(self) -> None:
         """Check, before hours are spent, whether it can work.
 

@@ -125,6 +125,11 @@ class TSDF(Mesher):
         """See `Mesher.needs_prior`."""
         return not self.sky or self._trusts_prior
 
+    @property
+    def most_triangles(self) -> int | None:
+        """See `Mesher.most_triangles`."""
+        return AUTO_TRIANGLES if self.voxel == "auto" else None
+
     def needs_prior_of(self, views: Sequence[View], frame: Frame) -> bool:
         """See `Mesher.needs_prior_of`."""
         return self._trusts_prior or (not self.sky and may_show_sky(views, up_of_views(views, frame)))

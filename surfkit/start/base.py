@@ -73,6 +73,11 @@ class Start(Component):
         """Whether it looks at depth priors. Only then are they read and, where the data set has none, made."""
         return False
 
+    @property
+    def most_points(self) -> int | None:
+        """How many points it gives at most, however large the scene is; None for any number. For a forecast."""
+        return None
+
     def limited(self, points: int) -> Start:
         """The same start, limited to a number of points where it has a setting for that; for comparisons."""
         return self

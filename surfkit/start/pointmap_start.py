@@ -75,6 +75,11 @@ class PointmapStart(Start):
         """See `Start.is_dense`."""
         return True
 
+    @property
+    def most_points(self) -> int:
+        """See `Start.most_points`."""
+        return self.points
+
     def limited(self, points: int) -> PointmapStart:
         """See `Start.limited`."""
         return replace(self, points=min(self.points, points))

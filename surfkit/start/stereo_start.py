@@ -109,6 +109,11 @@ class StereoStart(Start):
         """See `Start.needs_prior`."""
         return True
 
+    @property
+    def most_points(self) -> int:
+        """See `Start.most_points`."""
+        return self.most if self.points == "auto" else self.points
+
     def limited(self, points: int) -> StereoStart:
         """See `Start.limited`."""
         wanted = self.points if self.points == "auto" else min(self.points, points)

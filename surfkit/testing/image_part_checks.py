@@ -322,6 +322,9 @@ def _check_estimate(name: str, estimator: DepthEstimator, estimate: Estimate, ca
         assert value.dim() == 2, f"{name}: {what} has shape {tuple(value.shape)}, not (h, w)"
         assert torch.isfinite(value).all(), f"{name}: {what} is not finite; write 0 where there is none"
     assert inverse.shape == confidence.shape, f"{name}: inverse and confidence have different shapes"
+    told = estimator.of_map(camera)
+    size = f"{inverse.shape[1]} x {inverse.shape[0]} px, and {name}.of_map tells {told.width} x {told.height}"
+    assert inverse.shape == (told.height, told.width), f"{name}: a map has {size}: the time of maps is foretold by it"
     assert (inverse >= 0).all(), f"{name}: an inverse depth is below 0"
     assert ((confidence >= 0) & (confidence <= 1)).all(), f"{name}: confidence must lie in [0, 1]"
     assert (normal is not None) == estimator.oriented, f"{name}: normals are given if and only if it is `oriented`"

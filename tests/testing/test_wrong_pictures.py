@@ -354,6 +354,12 @@ class Bare(Knows):
         return replace(estimate, normal=None)
 
 
+class Half(Knows):
+    def spoilt(self, estimate):
+        half = {"inverse": estimate.inverse[::2, ::2], "confidence": estimate.confidence[::2, ::2]}
+        return replace(estimate, **half, normal=estimate.normal[:, ::2, ::2])
+
+
 class Forgets(Knows):
     """Leaves a file in its work folder, and goes on from it with other depths."""
 
@@ -373,6 +379,7 @@ class Forgets(Knows):
         (Outwards(), "Outwards: a normal points away from the camera"),
         (Percent(), r"Percent: confidence .*\[0, 1\]"),
         (Bare(), "Bare: normals .*`oriented`"),
+        (Half(), "Half: a map has 36 x 27 px, and Half.of_map tells 72 x 54: "),
         (Knows(scale=20.0), "Knows is `aligned`, .* 20 times"),
         (Forgets(), "Forgets.estimate .*interruption is not repeatable: inverse"),
     ],

@@ -171,9 +171,9 @@ def rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     room = found.room
     steps = ", ".join(f"{1000 * seconds:.0f}" for seconds in found.step_seconds)
     table = [
-        ("points at the end", likely_range(found)),
+        ("points", f"{found.first:,} at the start; at the end {likely_range(found)}"),
         ("time", f"{duration(found.seconds)} ({steps} ms a step, from the beginning to the end)"),
-        *_depth_rows(found),
+        *_other_rows(found),
         (
             "memory",
             f"{size(found.memory_bytes)}, of which photographs {size(found.cache_bytes)}; "
@@ -189,10 +189,14 @@ def rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     return table
 
 
-def _depth_rows(found: ResourceEstimate) -> list[tuple[str, str]]:
-    """Of depth maps, if some are made."""
-    text = f"{duration(found.depth_seconds)} before, for depth maps, unless an earlier run has made them"
-    return [("", text)] if found.depth_seconds else []
+def _other_rows(found: ResourceEstimate) -> list[tuple[str, str]]:
+    """Of depth maps before the first step, and the mesh after the last, if they are made."""
+    maps = f"{duration(found.depth_seconds)} before, for depth maps, unless an earlier run has made them"
+    table = [("", maps)] if found.depth_seconds else []
+    if (mesh := found.mesh) is not None:
+        memory = f"{size(mesh.memory_bytes)} of memory beside the points"
+        table.append(("", f"{duration(mesh.seconds)} after, for the mesh, with {memory}"))
+    return table
 
 
 def _gpu_rows(found: ResourceEstimate) -> list[tuple[str, str]]:

@@ -95,6 +95,19 @@ class GpuEstimate:
 
 
 @dataclass(frozen=True)
+class MeshCosts:
+    """What making a mesh takes.
+
+    Attributes:
+        seconds: Without depth maps.
+        memory_bytes: Beside the points.
+    """
+
+    seconds: float
+    memory_bytes: int
+
+
+@dataclass(frozen=True)
 class ResourceEstimate:
     """What a whole run will take.
 
@@ -114,6 +127,9 @@ class ResourceEstimate:
         probe_seconds: That the probe took.
         movable_bytes: Points with their moments and statistics that can be kept elsewhere than where they are drawn.
         depth_seconds: Of the depth maps before, not among `seconds`; 0 where none are made, or a few do not tell.
+        mesh: What making the mesh takes after it, not among `seconds`; None where none is made, or a few photographs do
+            not tell.
+        first: Points at the beginning.
     """
 
     points: int
@@ -130,6 +146,8 @@ class ResourceEstimate:
     gpu: GpuEstimate | None = None
     movable_bytes: int = 0
     depth_seconds: float = 0.0
+    mesh: MeshCosts | None = None
+    first: int = 0
 
 
 def estimate(

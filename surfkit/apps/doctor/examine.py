@@ -316,6 +316,8 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
         told.append(f"ignore what is transparent in {own} photographs")
     if not recipe.has_stages:
         return (*told, f"reconstruct with method:{name_of(recipe.method)}")
+    if recipe.start.needs_prior:
+        return (*told, f"start from points of depth maps (start:{name_of(recipe.start)})")
     sparse = len(gathered.capture.xyz)
     pixels = sum(width * height for shot, size in sized for width, height in view_sizes(data, shot, size))
     count = recipe.start.expected(sparse or RANDOM_POINTS, pixels)

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from surfkit.apps.doctor.depth_time import depth_seconds
 from surfkit.apps.doctor.estimate import FixedCosts, MachineLimits, ResourceEstimate, advice, estimate, first_look
 from surfkit.apps.doctor.examine import ExaminedData, Told
+from surfkit.apps.doctor.few_photographs import Foretold, foretell
 from surfkit.apps.doctor.finding import Finding, from_errors
 from surfkit.apps.doctor.gather import depth_maps, heard
 from surfkit.apps.doctor.growth import Growth, growth
@@ -80,12 +80,17 @@ def forecast(
     load = _load(data, recipe, examined, plan)
     with tempfile.TemporaryDirectory(prefix="surfkit-doctor-") as folder:
         try:
-            scene, load = _scene(data, examined, load, Path(folder))
+            scene, load = _scene(data, examined, load, Path(folder) / "probe")
+            if told is not None:
+                told("a few photographs", 0, 1)
+            few = foretell(data, examined, recipe, plan.device, Path(folder) / "few")
+            if told is not None:
+                told("a few photographs", 1, 1)
         except BadInput as error:
             return None, from_errors("probe", [error])
         sizes = read_sizes(data, examined, {s.name for s in examined.gathered.train})
         pixels = sum(w * h for w, h in sizes)
-        first = recipe.start.expected(len(scene.cloud.xyz), pixels)
+        first = few.points or recipe.start.expected(len(scene.cloud.xyz), pixels)
         rising = growth(recipe.pretrain, first, pixels, plan.points, recipe.start.is_dense)
         parts = schedule(recipe.pretrain.steps, rising)
         held_back = within(parts, min(MAX_PROBE_POINTS, int(0.4 * room.memory_bytes / PROBE_POINT_BYTES)))
@@ -93,23 +98,24 @@ def forecast(
         priors = wanted and bool(_with_maps(data, examined, recipe))
         job = ProbeJob(recipe, scene, held_back, plan.steps, MAX_PROBE_S, priors, plan.device)
         probed = probe(job, None if told is None else lambda done, all_: told("probe", done, all_))
-        before = 0.0
-        if probed.failure is None and probed.written is not None:
-            before = depth_seconds(data, examined, recipe, sizes, plan.device, Path(folder))
     if probed.failure is not None or probed.written is None:
         return None, [_failed(probed, held_back)]
     found = estimate(load, parts, rising, probed, room)
-    found = replace(found, probe_seconds=time.perf_counter() - begun, depth_seconds=before)
+    found = replace(
+        found, probe_seconds=time.perf_counter() - begun, depth_seconds=few.depth_seconds, mesh=few.mesh, first=first
+    )
     look = first_look(found) if recipe.start.is_dense and recipe.start.needs_prior else []
-    return found, [*beyond(recipe, before > 0), *advice(found), *look]
+    return found, [*beyond(recipe, few), *advice(found), *look]
 
 
-def beyond(recipe: Recipe, with_maps: bool = False) -> list[Finding]:
-    """What of the run the forecast leaves out; `with_maps` says that the time of depth maps is in it."""
+def beyond(recipe: Recipe, few: Foretold) -> list[Finding]:
+    """What of the run the forecast leaves out."""
     later = ["the blocks, which are foretold when they are planned"] if recipe.partition is not None else []
     later += ["what the recipe refines"] if recipe.refine else []
-    later += ["making depth maps, where the data set has none"] if recipe.depth is not None and not with_maps else []
-    later += ["making the mesh"] if recipe.mesh is not None else []
+    later += (
+        ["making depth maps, where the data set has none"] if recipe.depth is not None and not few.depth_seconds else []
+    )
+    later += ["making the mesh"] if recipe.mesh is not None and few.mesh is None else []
     text = f"memory, disk and time are those of pretraining alone; the run needs more for: {'; '.join(later)}"
     return [Finding("note", "forecast", text)] if later else []
 
@@ -186,6 +192,7 @@ def _load(data: Data, recipe: Recipe, examined: ExaminedData, plan: ProbePlan) -
 
 def _scene(data: Data, examined: ExaminedData, load: FixedCosts, folder: Path) -> tuple[Scene, FixedCosts]:
     """The scene with a few views, undistorted or cut into a folder of ours, and what that has taken for each."""
+    folder.mkdir()
     train = examined.gathered.train
     chosen = [train[at * len(train) // min(PROBE_VIEWS, len(train))] for at in range(min(PROBE_VIEWS, len(train)))]
     start = time.perf_counter()

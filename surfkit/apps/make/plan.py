@@ -16,7 +16,7 @@ from surfkit.apps.doctor.estimate import (
 from surfkit.apps.doctor.examine import ExaminedData, examine
 from surfkit.apps.doctor.finding import Finding
 from surfkit.apps.doctor.forecast import ProbePlan, forecast, read_sizes
-from surfkit.apps.make.quality import FIXED_SECONDS, QUALITIES, Quality, QualityName
+from surfkit.apps.make.quality import FIXED_SECONDS, MEGAPIXEL_SECONDS, QUALITIES, Quality, QualityName
 from surfkit.apps.make.record import Decisions, Forecast
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -65,13 +65,15 @@ def decide(data: Data, name: QualityName, steps: int | None, device: Device, out
         raise BadInput(f"{errors[0]}{more}")
     count = len(examined.gathered.train)
     length = steps or quality.steps(recipe, count, device)
-    found, more_told = _forecast(data, with_steps(recipe, length), examined, device, out)
+    closes = native.module() is not None
+    run = with_steps(closed(recipe) if closes else recipe, length)
+    found, more_told = _forecast(data, run, examined, device, out)
     for finding in (*told, *more_told):
         if finding.level == "warning" and finding.what not in SEPARATE_FINDINGS:
             say(f"{finding.level}: {finding.text}")
     pixels = sum(w * h for w, h in read_sizes(data, examined, {shot.name for shot in examined.gathered.train}))
     decided = chosen(quality, found, count, length, pixels / 1e6)
-    if native.module() is None:
+    if not closes:
         say(f"the mesh is that of the recipe: mesh:{CLOSED}, which is closed, needs the compiled part of surfkit")
         return decided
     return replace(decided, mesher=CLOSED)  # one continuous surface is what a client can use
@@ -104,8 +106,13 @@ def chosen(
     """
     if found is None:
         return Decisions(quality.recipe, "one model, as its memory could not be forecast", photographs, steps)
-    other = None if found.gpu is not None else round(FIXED_SECONDS + quality.megapixel_seconds * megapixels, 1)
-    told = Forecast(round(found.seconds, 1), found.memory_bytes, found.run_bytes, other)
+    other, mesh = None, found.mesh
+    if found.gpu is None and mesh is not None:
+        guess = FIXED_SECONDS + MEGAPIXEL_SECONDS * megapixels
+        other = round(found.depth_seconds + mesh.seconds + guess, 1)
+    told = Forecast(
+        round(found.seconds, 1), found.memory_bytes, found.run_bytes, other, None if mesh is None else mesh.memory_bytes
+    )
     need, usable, where = _tightest(found)
     rule = f"needs {size(need)} of {where} without photographs, and {size(usable)} (90 % of what is free) can be used"
     if need <= usable:
@@ -149,8 +156,13 @@ def recipe_of(decisions: Decisions) -> Recipe:
         grid = ContractedGrid(blocks=(decisions.blocks, decisions.blocks))
         recipe = replace(recipe, partition=grid, pretrain=stage, start=recipe.start.limited(most))
     if decisions.mesher == CLOSED:
-        recipe = replace(recipe, mesh=Visibility(oversampling=getattr(recipe.mesh, "oversampling", 1.0)))
+        recipe = closed(recipe)
     return with_steps(recipe, decisions.steps)
+
+
+def closed(recipe: Recipe) -> Recipe:
+    """The recipe with a mesh that is closed, as fine as its own."""
+    return replace(recipe, mesh=Visibility(oversampling=getattr(recipe.mesh, "oversampling", 1.0)))
 
 
 def rows(decisions: Decisions) -> list[tuple[str, str]]:
@@ -172,8 +184,9 @@ def rows(decisions: Decisions) -> list[tuple[str, str]]:
         whole = f"about {duration(told.seconds)} for the steps of optimisation; {later} come on top"
         if told.other_seconds is not None:
             whole = f"about {duration(told.seconds + told.other_seconds)}: {duration(told.seconds)} for the steps of "
-            whole += f"optimisation, as measured, and a guess within a factor of 3 for {later}"
+            whole += f"optimisation, as measured, and {duration(told.other_seconds)} for {later}, within a factor of 3"
         found.append(("time", whole))
-        found.append(("memory", f"{size(told.memory_bytes)} for the optimisation; making the mesh may take more"))
+        mesh = "may take more" if told.mesh_bytes is None else f"takes {size(told.mesh_bytes)} beside the points"
+        found.append(("memory", f"{size(told.memory_bytes)} for the optimisation; making the mesh {mesh}"))
         found.append(("disk", f"{size(told.disk_bytes)} for the model; {later} come on top"))
     return found

@@ -13,8 +13,9 @@ QualityName = Literal["draft", "normal", "high"]
 DRAFT_STEPS = 500
 """Steps of a first look, as `surfkit doctor` recommends it."""
 DRAFT_LONGEST_PX = 800
-FIXED_SECONDS = 50.0
-"""What all steps beside the optimisation take of even the smallest survey."""
+FIXED_SECONDS, MEGAPIXEL_SECONDS = 40.0, 6.0
+"""What texture, maps and reports take on 2 cores: of even the smallest survey, and for a megapixel of its photographs.
+Measured on two surveys (bench/log/field.md)."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,6 @@ class Quality:
         at_most: Most steps.
         times: By which the usual number of steps is multiplied.
         divides: Whether the scene is divided into blocks where one model cannot hold it.
-        megapixel_seconds: What a megapixel of the photographs takes on 2 cores beside the optimisation: depth maps,
-            mesh, texture, maps and reports. Measured on two surveys (bench/log/field.md).
     """
 
     recipe: str
@@ -36,7 +35,6 @@ class Quality:
     at_most: int | None = None
     times: int = 1
     divides: bool = True
-    megapixel_seconds: float = 20.0
 
     def reading(self, given: ReadSettings) -> ReadSettings:
         """How photographs are read: at the size of the preset, unless the user has given one."""
@@ -60,7 +58,7 @@ class Quality:
 
 QUALITIES: dict[QualityName, Quality] = {
     # At its 5 pixels between points a draft is so small that no memory is too small for it.
-    "draft": Quality("surface-short", DRAFT_LONGEST_PX, DRAFT_STEPS, divides=False, megapixel_seconds=12.0),
+    "draft": Quality("surface-short", DRAFT_LONGEST_PX, DRAFT_STEPS, divides=False),
     "normal": Quality("surface", DEFAULT_LONGEST_PX),
     "high": Quality("surface", None, times=2),
 }

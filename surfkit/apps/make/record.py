@@ -44,14 +44,16 @@ class Forecast:
         seconds: Of the optimisation.
         memory_bytes: The same.
         disk_bytes: Of the model.
-        other_seconds: Of depth maps, mesh, texture, maps and reports, as `Quality.megapixel_seconds` has it; None on a
-            GPU.
+        other_seconds: Of depth maps and mesh, as measured on a few photographs, and a guess for texture, maps and
+            reports; None on a GPU, and where the mesh cannot be foretold.
+        mesh_bytes: Memory that making the mesh takes beside the points; None where it cannot be foretold.
     """
 
     seconds: float
     memory_bytes: int
     disk_bytes: int
     other_seconds: float | None = None
+    mesh_bytes: int | None = None
 
 
 @dataclass

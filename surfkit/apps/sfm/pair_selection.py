@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.settings import Settings
+from surfkit.core.events import Progress, emit
 from surfkit.scene.earth import geocentric
 
 MAX_EXHAUSTIVE_PHOTOS = 60
@@ -25,6 +26,8 @@ SEQUENCE_NEIGHBOURS = 3
 """Neighbours before and after by time or name that are compared too, where positions may be wrong or lacking."""
 VOCABULARY_SIZE, VOCABULARY_DESCRIPTORS, DESCRIPTORS_PER_PHOTO = 64, 20_000, 300
 """Clusters of descriptors; descriptors that they are made from; and that are taken of a photograph."""
+LIKENESS_BATCH = 256
+"""Photographs that are compared with all others in one matrix product: one by one, each would read all vectors."""
 
 DISTANCE_NEIGHBOURS = 8
 """Neighbours that tell how far away what photographs show is."""
@@ -170,13 +173,18 @@ def alike(
     taken = rng.permutation(count)[: max(1, VOCABULARY_DESCRIPTORS // DESCRIPTORS_PER_PHOTO)]
     sample = np.concatenate([_some(descriptors(int(at)), DESCRIPTORS_PER_PHOTO, rng) for at in taken])
     words, _ = kmeans2(sample, min(VOCABULARY_SIZE, len(sample)), minit="++", seed=rng)
-    vectors = np.stack([vlad(descriptors(at).astype(np.float32), words) for at in range(count)])
-    pairs = set()
-    for at in wanted:
-        likeness = vectors @ vectors[at]
-        likeness[at] = -np.inf
-        for other in np.argsort(-likeness, kind="stable")[: min(most, count - 1)].tolist():
-            pairs.add((min(at, other), max(at, other)))
+    vectors = np.empty((count, words.size), np.float32)
+    for at in range(count):
+        vectors[at] = vlad(descriptors(at).astype(np.float32), words)
+        emit(Progress("summing up photographs", at + 1, count))
+    pairs, of_each = set(), min(most, count - 1)
+    for start in range(0, len(wanted), LIKENESS_BATCH):
+        batch = np.asarray(wanted[start : start + LIKENESS_BATCH])
+        likeness = vectors[batch] @ vectors.T
+        likeness[np.arange(len(batch)), batch] = -np.inf
+        for at, others in zip(batch.tolist(), np.argsort(-likeness, kind="stable")[:, :of_each].tolist(), strict=True):
+            pairs |= {(min(at, other), max(at, other)) for other in others}
+        emit(Progress("looking for photographs alike", start + len(batch), len(wanted)))
     return pairs
 
 

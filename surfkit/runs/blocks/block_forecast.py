@@ -152,7 +152,7 @@ def report_forecast(out: Path, found: Forecast) -> None:
         text += f"; a block needs up to {size(found.memory_bytes)} of memory, {size(memory)} are free"
     if found.gpu_bytes:
         text += f"; a block needs up to {size(found.gpu_bytes)} of the memory of its GPU"
-    say(text)
+    say(f"{text}; merging the blocks and making the mesh come on top")
     if found.least_bytes > disk:
         raise BadInput(
             f"{out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "

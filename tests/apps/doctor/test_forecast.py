@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.apps.doctor import depth_time
 from surfkit.apps.doctor.estimate import (
     FixedCosts,
     MachineLimits,
+    MeshCosts,
     advice,
     duration,
     estimate,
@@ -24,6 +24,7 @@ from surfkit.apps.doctor.estimate import (
     slope,
 )
 from surfkit.apps.doctor.examine import examine
+from surfkit.apps.doctor.few_photographs import Foretold
 from surfkit.apps.doctor.forecast import ProbePlan, beyond, forecast, schedule, within
 from surfkit.apps.doctor.growth import Growth, growth
 from surfkit.apps.doctor.probe import (
@@ -43,8 +44,6 @@ from surfkit.core.memory import size
 from surfkit.core.tree import evolve
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
-from surfkit.depth.base import Estimate
-from surfkit.depth.patch_match import PatchMatch
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.losses import NormalPrior, Reprojection
@@ -187,7 +186,8 @@ def test_parts_of_a_run_avoid_its_edits_and_the_limits_of_a_probe():
 
 def test_what_comes_after_pretraining_is_named():
     found = [
-        [finding.text for finding in beyond(recipe)] for recipe in map(recipes().get, ("2dgs", "citygs2", "citygs"))
+        [finding.text for finding in beyond(recipe, Foretold())]
+        for recipe in map(recipes().get, ("2dgs", "citygs2", "citygs"))
     ]
     assert (
         found[0][0].endswith("the run needs more for: making the mesh")
@@ -195,7 +195,10 @@ def test_what_comes_after_pretraining_is_named():
         and "refines" not in found[1][0]
     )
     assert "the blocks" in found[2][0] and "refines" in found[2][0]
-    assert beyond(replace(recipes()["2dgs"], mesh=None)) == []
+    assert beyond(replace(recipes()["2dgs"], mesh=None), Foretold()) == []
+    assert beyond(recipes()["2dgs"], Foretold(mesh=MeshCosts(1.0, 1))) == []
+    assert "depth maps" in beyond(recipes()["surface"], Foretold())[0].text
+    assert "depth maps" not in beyond(recipes()["surface"], Foretold(depth_seconds=1.0))[0].text
 
 
 def test_points_become_as_many_as_wanted(farm):
@@ -428,29 +431,3 @@ def test_a_first_look_is_proposed_where_the_run_takes_hours(seconds, count):
     found = estimate(LOAD, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), ROOM)
     notes = first_look(replace(found, seconds=float(seconds)))
     assert len(notes) == count and all("recipe:surface-short" in note.text and "4 h" in note.text for note in notes)
-
-
-def test_depth_maps_before_the_first_step_are_foretold_by_a_few_photographs(tmp_path, monkeypatch):
-    write_colmap(tmp_path, photograph(Flight(kind="grid", views=16, width=64, height=48, points=300)), tracks=True)
-    asked, now = [], [0.0]
-
-    def estimate(self, given, wanted):
-        asked.append((len(given.views), len(given.observations.seen)))
-        for at in wanted:
-            now[0] += 6.0
-            yield Estimate(at, torch.ones(2, 2), torch.ones(2, 2))
-
-    monkeypatch.setattr(PatchMatch, "estimate", estimate)
-    monkeypatch.setattr(depth_time.time, "perf_counter", lambda: now[0])
-    data, recipe = Data(tmp_path, test_every=0), recipes()["surface-short"]
-    examined = examine(data, recipe, quick=True)
-
-    def seconds(recipe, sizes):
-        folder = tmp_path / f"work {len(list(tmp_path.iterdir()))}"
-        folder.mkdir()
-        return depth_time.depth_seconds(data, examined, recipe, sizes, "cpu", folder)
-
-    assert seconds(recipe, [(64, 48)] * 3_000) == pytest.approx(18_000) and asked == [(12, 12)]
-    assert seconds(recipe, [(6400, 4800)] * 16) == pytest.approx(96 * 50**2), "maps of up to 1600 px, half the size"
-    assert seconds(recipes()["2dgs"], [(64, 48)]) == 0 and len(asked) == 2
-    assert "depth maps" in beyond(recipe)[0].text and "depth maps" not in beyond(recipe, True)[0].text

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from surfkit.apps.doctor.estimate import GpuEstimate, MachineLimits
+from surfkit.apps.doctor.estimate import GpuEstimate, MachineLimits, MeshCosts
 from surfkit.apps.make.plan import chosen, recipe_of, rows
-from surfkit.apps.make.quality import FIXED_SECONDS, QUALITIES
+from surfkit.apps.make.quality import FIXED_SECONDS, MEGAPIXEL_SECONDS, QUALITIES
 from surfkit.apps.make.record import Decisions
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -26,7 +26,7 @@ def test_one_model_where_it_fits():
     found = chosen(QUALITIES["normal"], estimated(), 40, 1_200)
     assert (found.recipe, found.blocks, found.steps) == ("surface", None, 1_200)
     assert "needs 3.2 GB of memory" in found.why and "9.0 GB (90 % of what is free)" in found.why
-    assert recipe_of(found).pretrain.steps == 1_200 and dict(rows(found))["time"].startswith("about 2 min: 60 s for")
+    assert recipe_of(found).pretrain.steps == 1_200 and dict(rows(found))["time"].startswith("about 60 s for")
 
 
 def test_blocks_where_it_does_not():
@@ -75,11 +75,20 @@ def test_the_mesh_that_is_delivered_is_closed_and_as_fine_as_that_of_the_recipe(
 
 
 def test_the_time_of_all_steps_is_told_beforehand_on_a_cpu():
-    found = chosen(QUALITIES["normal"], estimated(), 40, 100, megapixels=30.0)
+    measured = estimated(depth_seconds=300.0, mesh=MeshCosts(100.0, 10**9))
+    found = chosen(QUALITIES["normal"], measured, 40, 100, megapixels=30.0)
     assert found.forecast is not None
-    assert found.forecast.other_seconds == FIXED_SECONDS + 30 * QUALITIES["normal"].megapixel_seconds
-    told = dict(rows(found))["time"]
-    assert told.startswith("about ") and "guess" in told and "come on top" not in told
+    assert found.forecast.other_seconds == 400 + FIXED_SECONDS + 30 * MEGAPIXEL_SECONDS
+    told = dict(rows(found))
+    assert (
+        told["time"].startswith("about 11 min: 60 s for the steps")
+        and "and 10 min for depth maps, mesh" in told["time"]
+    )
+    assert "come on top" not in told["time"] and told["memory"].endswith(
+        "making the mesh takes 1.0 GB beside the points"
+    )
+    unknown = dict(rows(chosen(QUALITIES["normal"], estimated(), 40, 100)))
+    assert "mesh, texture, maps and reports come on top" in unknown["time"] and "may take more" in unknown["memory"]
     longer = found.longer(300).forecast
     assert longer is not None and longer.other_seconds == found.forecast.other_seconds
     on_gpu = chosen(QUALITIES["normal"], estimated(gpu=GpuEstimate(10**9, 10**8, 8e2, 8 * 10**9)), 40, 100)

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from surfkit.apps.sfm import pair_selection
 from surfkit.apps.sfm.exif import Exif
 from surfkit.apps.sfm.inspect_photos import Photo
 from surfkit.apps.sfm.pair_selection import (
@@ -74,6 +75,29 @@ def test_likeness_finds_the_same_scene():
     found = alike(24, 3, scenes(24, 4), 0, range(24))
     assert len(found) >= 24 * 3 / 2 and all((one - two) % 4 == 0 for one, two in found)
     assert found == alike(24, 3, scenes(24, 4), 0, range(24))
+
+
+def test_likeness_is_that_of_each_photograph_with_all_others_however_many_are_compared_at_once(monkeypatch):
+    descriptors = scenes(50, 7)
+    words = np.random.default_rng(1).integers(0, 200, (16, 128)).astype(np.float32)
+    monkeypatch.setattr(pair_selection, "kmeans2", lambda *given, **settings: (words, None))
+    vectors = [vlad(descriptors(at).astype(np.float32), words).astype(np.float64) for at in range(50)]
+    wanted = set()
+    for at in range(0, 50, 3):
+        others = sorted((-float(vectors[at] @ vectors[other]), other) for other in range(50) if other != at)
+        wanted |= {(min(at, other), max(at, other)) for _, other in others[:4]}
+    for batch in (1, 5, 256):
+        monkeypatch.setattr(pair_selection, "LIKENESS_BATCH", batch)
+        assert alike(50, 4, descriptors, 0, range(0, 50, 3)) == wanted
+
+
+def test_looking_for_photographs_alike_tells_how_far_it_is(monkeypatch):
+    monkeypatch.setattr(pair_selection, "LIKENESS_BATCH", 8)
+    told = []
+    monkeypatch.setattr(pair_selection, "emit", lambda event: told.append((event.what, event.done, event.total)))
+    alike(24, 3, scenes(24, 4), 0, range(20))
+    assert told[:24] == [("summing up photographs", at, 24) for at in range(1, 25)]
+    assert told[24:] == [("looking for photographs alike", done, 20) for done in (8, 16, 20)]
 
 
 def test_only_photographs_without_a_position_are_compared_by_likeness_besides_gps():

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from surfkit.plugin import BadInput, DepthEstimator, DepthInput, DepthRegression, Estimate
+from surfkit.plugin import BadInput, Camera, DepthEstimator, DepthInput, DepthRegression, Estimate
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,10 @@ class NewPart(DepthEstimator):
                 "give 1 or more, 2 or more, and more than 0"
             )
 
+    def of_map(self, camera: Camera) -> Camera:
+        """See `DepthEstimator.of_map`."""
+        return camera.fitted(self.longest)
+
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         """See `DepthEstimator.estimate`."""
         for at in wanted:
@@ -42,8 +46,8 @@ class NewPart(DepthEstimator):
             if len(places) < self.points:
                 yield Estimate(at, None, None)
                 continue
-            by = min(1.0, self.longest / max(camera.width, camera.height))
-            width, height = max(1, round(by * camera.width)), max(1, round(by * camera.height))
+            small = self.of_map(camera)
+            width, height = small.width, small.height
             sides = np.array([width, height]) / max(width, height)
             x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
             distance, near = cKDTree(places * sides).query(np.stack([x, y], -1) * sides, k=self.points)
