@@ -39,7 +39,6 @@ from scenes import city
 
 import surfkit
 from surfkit.appearance import CameraResponse
-from surfkit.appearance.response import curved, falloff
 from surfkit.core.codec import read_json
 from surfkit.evaluate.images.measure_images import aligned_halves
 from surfkit.io.datasets.raw_dataset import load_pycolmap
@@ -49,6 +48,7 @@ from surfkit.raster.psnr import psnr
 from surfkit.raster.ssim import ssim
 from surfkit.runs.photo_light import LightRecord
 from surfkit.scene.photos import read_photo
+from surfkit.scene.response import curved, falloff
 from surfkit.scene.srgb import from_linear, linear
 
 PACK = Path(__file__).resolve().parents[1].parent / "shared/data/shibuya-synth"

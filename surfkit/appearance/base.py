@@ -17,7 +17,7 @@ from surfkit.scene.camera import Camera
 
 @dataclass(frozen=True)
 class PhotoLight:
-    """How cameras changed the light of V photographs, from the colours of sparse points; `appearance.response` says
+    """How cameras changed the light of V photographs, from the colours of sparse points; `scene.response` says
     what the numbers mean.
 
     Attributes:

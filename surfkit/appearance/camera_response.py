@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from surfkit.appearance.base import Appearance, PhotoLight
-from surfkit.appearance.response import (
+from surfkit.primitives.points import Columns
+from surfkit.raster import native
+from surfkit.scene.camera import Camera
+from surfkit.scene.response import (
     CENTRE,
     CURVE,
     KNEE,
@@ -20,9 +23,6 @@ from surfkit.appearance.response import (
     falloff,
     sensor_scale,
 )
-from surfkit.primitives.points import Columns
-from surfkit.raster import native
-from surfkit.scene.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class CameraResponse(Appearance):
 
 
 def sensor_axes(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:
-    """(W,) x and (H,) y of the pixels on the sensor, see `appearance.response`."""
+    """(W,) x and (H,) y of the pixels on the sensor, see `scene.response`."""
     x, y = camera.ray_axes(like.dtype, like.device)
     scale = sensor_scale(camera)
     return x * (camera.fx * scale), y * (camera.fy * scale)

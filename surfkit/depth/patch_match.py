@@ -22,7 +22,7 @@ from surfkit.depth.cost_volume import ray_map
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
-from surfkit.depth.photo_light import evened, in_one_light, light_of_tracks, stretched
+from surfkit.depth.photo_light import EvenLight, stretched
 from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
@@ -77,7 +77,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 9
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -227,8 +227,8 @@ class PatchMatchWorkspace:
         self.sweep = InitialPlaneSweep(longest=settings.coarsest)
         self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
         kept, every = self.room(), range(len(pairs))
-        self.light = light_of_tracks(given, lambda at: self.sweep.picture(given, at))
-        self.small = lru_cache(MAX_CACHED_PICTURES)(lambda at: evened(self.sweep.picture(given, at), self.light, at))
+        self.light = EvenLight(given)
+        self.small = lru_cache(MAX_CACHED_PICTURES)(lambda at: self.light.picture(self.sweep.picture(given, at), at))
         self.value = lru_cache(2 * kept)(self.read)
         self.greys = [
             lru_cache(kept)(partial(self.halved, level)) for level in range(1 + max(map(self.levels, every), default=0))
@@ -276,7 +276,7 @@ class PatchMatchWorkspace:
         camera = self.camera(at, 0)
         view = self.given.views[at]
         rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels).to(torch.float32)
-        return stretched(255 * in_one_light(rgb.mean(0) / 255, self.light, at, camera))
+        return stretched(255 * self.light.even(rgb.mean(0) / 255, at, camera))
 
     def grey(self, at: int, level: int) -> GreyImage:
         """A photograph at a level."""

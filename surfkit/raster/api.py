@@ -40,18 +40,11 @@ STANDARD = ("means", "quats", "scales", "opacities", "sh0", "sh_rest")
 DILATION = 0.3
 """Variance that 3DGS adds to the footprint of an ellipsoid, px^2."""
 
-EDGE_ON = 2e-3
-"""Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
-
 PRIMITIVE_KINDS = ("surfel", "gaussian")
 """What the rasterizers of surfkit draw: flat discs (2DGS) and ellipsoids (3DGS)."""
 
 GEOMETRIES = ("axis", "plane", "ray")
 """How ellipsoids are evaluated; see `Splats.geometry`."""
-
-MIN_FOOTPRINT = 1e-6
-"""Pixels: ellipsoids of geometry "ray" whose standard deviation on the screen is below this in a direction are not
-drawn, as nothing widens them there."""
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import ALPHA_MIN, CUTOFF, EDGE_ON, MIN_FOOTPRINT, Splats
+from surfkit.raster.api import ALPHA_MIN, CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import rotations
 
 ANTIALIAS_FLOOR = 2.5e-5
 LOW_PASS_SIGMA = 3.0
 """The contour whose box has the low-pass filter's centre in its middle."""
+
+EDGE_ON = 2e-3
+"""Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
+
+MIN_FOOTPRINT = 1e-6
+"""Pixels: ellipsoids of geometry "ray" whose standard deviation on the screen is below this in a direction are not
+drawn, as nothing widens them there."""
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 
 from surfkit.appearance.base import PhotoLight
-from surfkit.appearance.response import CENTRE, CURVE, FALLOFF, mean_falloff
-from surfkit.appearance.track_light import MIN_SEEN, LightSpread, TrackLight, fit_light, rows_of, track_colors
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
@@ -21,7 +19,9 @@ from surfkit.io.datasets.read import observations
 from surfkit.raster.api import Maps
 from surfkit.runs.folder import Run, RunStage
 from surfkit.scene.observations import Observations
+from surfkit.scene.response import CENTRE, CURVE, FALLOFF, mean_falloff
 from surfkit.scene.scene import Scene, View
+from surfkit.scene.track_light import MIN_SEEN, LightSpread, TrackLight, fit_light, rows_of, track_colors
 
 Shot = TypeVar("Shot")
 """A photograph."""
@@ -46,7 +46,7 @@ class PhotoNumbers:
 
 @dataclass(frozen=True)
 class CameraNumbers:
-    """A camera in light.json, see `surfkit.appearance.response`.
+    """A camera in light.json, see `surfkit.scene.response`.
 
     Attributes:
         falloff: Stops at r^2, r^4 and r^6.

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from surfkit.appearance.base import Appearance, PhotoLight, joined
-from surfkit.appearance.response import OF_CAMERA, STOPS
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target
@@ -24,6 +23,7 @@ from surfkit.losses.transients import Transients
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
+from surfkit.scene.response import OF_CAMERA, STOPS
 from surfkit.testing.equality import assert_same, assert_tensor, twin, unchanged
 from surfkit.testing.inputs import cloud, depth_input, maps, splats, target
 from surfkit.testing.synthetic import Synthetic

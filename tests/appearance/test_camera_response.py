@@ -7,9 +7,9 @@ from numpy.polynomial import legendre
 
 from surfkit.appearance import CameraResponse
 from surfkit.appearance.camera_response import responded, sensor_axes
-from surfkit.appearance.response import curve_slope, curved
 from surfkit.raster import native
 from surfkit.scene.camera import Camera
+from surfkit.scene.response import curve_slope, curved
 from surfkit.scene.srgb import from_linear, linear
 
 POSE = torch.eye(4, dtype=torch.float64)

@@ -8,7 +8,6 @@ from PIL import Image
 from two_blocks import EVERY, STEPS, stop_after
 
 from surfkit.appearance import CameraResponse
-from surfkit.appearance.track_light import TrackColors, TrackLight
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.io.datasets.data import Data
@@ -23,6 +22,7 @@ from surfkit.runs.pipeline import load_run, loaded, opened, run
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.photos import view_photo
 from surfkit.scene.srgb import from_linear, linear
+from surfkit.scene.track_light import TrackColors, TrackLight
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover

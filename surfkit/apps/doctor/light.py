@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from surfkit.appearance.track_light import MIN_SEEN, LightSpread, TrackColors, fit_light
 from surfkit.apps.doctor.examine_photos import Photograph
 from surfkit.apps.doctor.finding import Finding
 from surfkit.apps.doctor.gather import Gathered
 from surfkit.apps.doctor.geometry import seen_by
 from surfkit.io.datasets.photo_cameras import cameras_of
 from surfkit.runs.recipe import Recipe
+from surfkit.scene.track_light import MIN_SEEN, LightSpread, TrackColors, fit_light
 
 MIN_PHOTOGRAPHS = 3
 """Photographs that are compared, at least."""

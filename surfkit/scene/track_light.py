@@ -15,7 +15,12 @@ import numpy as np
 from scipy import sparse
 from scipy.ndimage import map_coordinates
 
-from surfkit.appearance.response import (
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.scene.normal_equations import solved
+from surfkit.scene.observations import Observations
+from surfkit.scene.photos import read_draft
+from surfkit.scene.response import (
     CENTRE,
     CURVE,
     FALLOFF,
@@ -29,13 +34,10 @@ from surfkit.appearance.response import (
     falloff,
     sensor_scale,
 )
-from surfkit.core.check import BadInput
-from surfkit.scene.normal_equations import solved
-from surfkit.scene.observations import Observations
-from surfkit.scene.photos import read_draft
 from surfkit.scene.scene import View
 from surfkit.scene.srgb import from_linear, linear
 
+PHASE = "comparing the light of photographs"
 DRAFT_SIDE_PX = 256
 """Longer side at which photographs are read, pixels, or up to twice that: the colour of a place is a mean around it."""
 DARK, BRIGHT = 0.03, 0.97
@@ -87,7 +89,7 @@ class TrackLight:
 
     Attributes:
         stops: (V, 3) of red, green and blue of each photograph, with a mean of 0.
-        cameras: (C, 8) numbers of each camera, see `appearance.response`.
+        cameras: (C, 8) numbers of each camera, see `scene.response`.
         seen: (V,) int64, how many points each photograph shares with others; below `MIN_SEEN` its stops are a guess.
         deviation: Standard deviation of what is left, of sRGB colours in [0, 1].
     """
@@ -125,8 +127,11 @@ def track_colors(views: Sequence[View], tracks: Observations) -> TrackColors:
         place = (share * (camera.width, camera.height) - (camera.cx, camera.cy)) * sensor_scale(camera)
         return np.full(len(share), at), rows[one.points[some]], place, np.stack(colors, 1) / 255
 
+    found = []
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        found = [one for one in pool.map(look, range(len(views))) if one is not None]
+        for done, one in enumerate(pool.map(look, range(len(views))), 1):
+            emit(Progress(PHASE, done, len(views)))
+            found += [one] if one is not None else []
     if not found:
         return TrackColors(
             *(np.zeros(shape, kind) for shape, kind in (((0,), int), ((0,), int), ((0, 2), float), ((0, 3), float)))

@@ -6,8 +6,12 @@ import torch
 from PIL import Image
 
 from surfkit.appearance import response
-from surfkit.appearance.response import curved
-from surfkit.appearance.track_light import (
+from surfkit.scene.camera import Camera
+from surfkit.scene.observations import Observations, Observations2D
+from surfkit.scene.response import curved
+from surfkit.scene.scene import View
+from surfkit.scene.srgb import from_linear, linear
+from surfkit.scene.track_light import (
     MIN_SEEN,
     LightSpread,
     TrackColors,
@@ -15,10 +19,6 @@ from surfkit.appearance.track_light import (
     rows_of,
     track_colors,
 )
-from surfkit.scene.camera import Camera
-from surfkit.scene.observations import Observations, Observations2D
-from surfkit.scene.scene import View
-from surfkit.scene.srgb import from_linear, linear
 
 PHOTOS, POINTS = 30, 400
 CORNER, BALANCE = 0.5, 0.15
