@@ -13,7 +13,8 @@ from functools import partial
 
 import numpy as np
 
-from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, EDGE_ON, T_MIN, Splats
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, T_MIN, Splats
+from surfkit.raster.projection import EDGE_ON
 from surfkit.scene.camera import Camera
 
 
