@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit.appearance import response
+from surfkit.scene import response
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations, Observations2D
 from surfkit.scene.response import curved
