@@ -83,6 +83,20 @@ class Appearance(Component):
             camera: That took it: which pixel lies where on the sensor.
         """
 
+    def of_scene(self, numbers: Tensor, photo: Tensor, camera: Camera) -> tuple[Tensor, Tensor] | None:
+        """The other way, from the colours of a photograph: both (3, H, W), colours of the scene, and bool where it is
+        at least so bright, as white was cut off. None where the model cannot tell, as by default.
+
+        Photographs are then compared with the scene in its own light: dark ones count as much as bright ones, beside
+        each other and beside the losses of geometry. For numbers that stay as they begin.
+
+        Args:
+            numbers: As of `__call__`.
+            photo: (3, H, W) in [0, 1].
+            camera: That took it.
+        """
+        return None
+
     @abstractmethod
     def folded(self, numbers: Tensor, params: Columns) -> Columns:
         """Raw parameters of the points whose colours are those of the mean photograph."""

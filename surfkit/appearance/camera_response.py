@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.response import (
     CENTRE,
     CURVE,
+    FALLOFF,
     KNEE,
     OF_CAMERA,
     STOPS,
@@ -23,6 +25,11 @@ from surfkit.scene.response import (
     falloff,
     sensor_scale,
 )
+
+WHITE = 250 / 255
+"""From here on white may have been cut off."""
+FINE = 4096
+"""Values of a response curve between which it is straight."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,9 @@ class CameraResponse(Appearance):
     Goldman, PAMI 2010), and stay as they are: renders of a model that is still learned tell less, and colours that
     depend on the direction would explain the exposure of photographs that look the same way. So stages, and blocks of a
     scene, have the same numbers. light.json in the run folder lists them.
+
+    Colours are compared in the light of the scene (`of_scene`): in that of each photograph, dark ones would count less
+    beside the losses of geometry. Where white was cut off the scene may be brighter.
 
     The mean stops of all photographs, less the falloff averaged over the picture, and their mean curve are no change.
     So the scene is as bright as the mean photograph, and files of splats have its colours as they are. A curve
@@ -75,9 +85,27 @@ class CameraResponse(Appearance):
         """See `Appearance.__call__`; no gradient by the numbers."""
         return _Responded.apply(color, numbers, *sensor_axes(camera, color))  # type: ignore[no-any-return, no-untyped-call]
 
+    @torch.no_grad()
+    def of_scene(self, numbers: Tensor, photo: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+        """See `Appearance.of_scene`; colours are limited to 1, and photographs have 8 bits."""
+        stops, of_camera = numbers.split([STOPS, OF_CAMERA])
+        back = torch.cat([-stops, -of_camera[FALLOFF], of_camera[CENTRE], torch.zeros_like(of_camera[CURVE])])
+        before = photo
+        if of_camera[CURVE].any():
+            before = inverse_table(of_camera[CURVE]).to(photo)[(255 * photo).round().long()]
+        color = self(back, before, camera)
+        return color, (photo >= WHITE) & (color < photo)
+
     def folded(self, numbers: Tensor, params: Columns) -> Columns:
         """The parameters as they are: the scene has the colours of the mean photograph already."""
         return params
+
+
+def inverse_table(curve: Tensor) -> Tensor:
+    """(256,) values that a response curve, (3,), maps to those of 8 bits."""
+    fine = np.linspace(0, 1, FINE)
+    curves = curved(fine, curve.cpu().double().numpy())
+    return torch.from_numpy(np.interp(np.arange(256) / 255, curves, fine))
 
 
 def sensor_axes(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from surfkit.appearance.base import Appearance, PhotoLight, joined
 from surfkit.core.check import BadInput, expect
 from surfkit.core.registry import class_path
+from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
@@ -71,6 +72,15 @@ class ImageAppearance:
         rate = stage.appearance.rate_at(state.index + 1, stage.steps) / 2**state.halvings
         return cls(stage.appearance, state.appearances, at, rate, camera)
 
+    def of_scene(self, photo: Tensor) -> tuple[Tensor, Tensor] | None:
+        """See `Appearance.of_scene`; `photo` is (3, H, W)."""
+        if len(self.leaves) > 1:
+            return None
+        found = self.model.of_scene(self.leaves[0].detach().to(photo), photo, self.camera)
+        if found is not None:
+            expect(f"{class_path(type(self.model))}.of_scene", found[0], tuple(photo.shape))
+        return found
+
     def shown(self, color: Tensor) -> Tensor:
         """(3, H, W) the render as the photograph would show it."""
         own, *shared = (leaf.to(color) for leaf in self.leaves)
@@ -96,3 +106,17 @@ class ImageAppearance:
             assert grad is not None, "what changes colours by a photograph's numbers does so by the shared ones"
             value, first, second = (self.table[name] for name in ("shared", "shared_first", "shared_second"))
             update(value, grad, first, second, self.rate, int(shown.sum()))
+
+
+@torch.no_grad()
+def in_light(
+    stage: Stage, state: StageState, at: int, target: Target, color: Tensor
+) -> tuple[Target, ImageAppearance | None]:
+    """The target of photograph `at` in the coming step, and what turns the render, (3, H, W), into its colours; where
+    the model knows the way back, the target is in the light of the scene, and nothing is to be turned."""
+    appearance = ImageAppearance.of_step(stage, state, at, target.view.camera)
+    found = None if appearance is None else appearance.of_scene(target.photo)
+    if found is None:
+        return target, appearance
+    photo, least = found
+    return replace(target, photo=torch.where(least & (color > photo), color, photo)), None

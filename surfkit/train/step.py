@@ -15,7 +15,7 @@ from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.edit import Edit, fitted, observe
 from surfkit.train.divide import edited, refuse_apart
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
-from surfkit.train.image_appearance import ImageAppearance
+from surfkit.train.image_appearance import in_light
 from surfkit.train.in_view import PointsInView, note_moved, with_frozen
 from surfkit.train.loss_gradients import (
     as_numbers,
@@ -56,7 +56,7 @@ def view_gradients(setup: StageSetup, state: StageState) -> StepResult:
 
     # Losses: the maps are compared with the photograph, and with a second view where a loss wants one.
     second = neighbour(setup, state, splats, at, render.maps) if stage.is_paired(index) else None
-    appearance = ImageAppearance.of_step(stage, state, at, camera)
+    target, appearance = in_light(stage, state, at, target, render.maps.need("color"))
     target = without_transients(stage, index, render.maps, target, appearance)
     compared = stage.weights_at(index), render.maps, replace(target, neighbour=second), appearance
     losses, total, chosen = loss_gradients(stage.losses, stage.signal, *compared)

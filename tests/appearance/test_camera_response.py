@@ -122,3 +122,21 @@ def test_a_photograph_of_another_camera_is_shown_with_its_own_principal_point():
     aside = replace(CAMERA, cx=6.5)
     shown = CameraResponse()(torch.tensor([0.0] * 3 + [1.0] + [0.0] * 7), torch.full((3, 23, 37), 0.5), aside)
     assert shown[0, 11].argmax() == 6 and shown[0, :, 6].argmax() in (10, 11)  # pixel rows on both sides of cy
+
+
+def test_the_way_back_leads_to_the_scene_but_where_white_was_cut_off(kernels):
+    given = 0.1 + 0.85 * colors(5)
+    exact = expected(given.double().numpy(), NUMBERS.double().numpy(), CAMERA)
+    photo = torch.from_numpy((255 * exact).round() / 255).float()
+    found, least = CameraResponse().of_scene(NUMBERS, photo, CAMERA)
+    assert 50 < least.sum() < least.numel() / 2
+    cut = torch.from_numpy(exact >= 1)
+    assert (least[cut] | (found[cut] >= photo[cut])).all() and (found[cut] <= given[cut] + 2e-2).all()
+    assert (found - given)[~cut].abs().max() < 0.02 and (found - given)[~cut].abs().mean() < 2e-3
+
+
+def test_dark_photographs_are_made_as_bright_as_the_scene():
+    numbers = torch.tensor([-1.0] * 3 + [0.0] * 8)
+    found, least = CameraResponse().of_scene(numbers, torch.full((3, 23, 37), 0.5), CAMERA)
+    assert not least.any() and torch.allclose(found, torch.tensor(from_linear(2 * linear(0.5))).float())
+    assert CameraResponse().of_scene(numbers, torch.ones(3, 23, 37), CAMERA)[0].max() == 1

@@ -1,17 +1,19 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
 import pytest
 import torch
 
-from surfkit.appearance import Exposure
-from surfkit.appearance.base import Appearance
+from surfkit.appearance import CameraResponse, Exposure
+from surfkit.appearance.base import Appearance, PhotoLight
 from surfkit.densify import LossGradient
 from surfkit.losses.base import Target
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.raster.api import Maps
+from surfkit.scene.srgb import from_linear, linear
 from surfkit.train.checkpoint import load, save
-from surfkit.train.image_appearance import ImageAppearance, first_appearances
+from surfkit.train.image_appearance import ImageAppearance, first_appearances, in_light
 from surfkit.train.loss_gradients import loss_gradients
 from surfkit.train.stage import Stage
 
@@ -147,3 +149,32 @@ def test_where_only_structure_counts_nothing_is_learned_of_photographs(begin):
     _, state = begin(stage)
     list(begin(stage)[0].run(state))
     assert not any(value.any() for value in state.appearances.values())
+
+
+def test_colours_are_compared_in_the_light_of_the_scene_where_the_way_back_is_known(begin):
+    """A photograph of half the exposure counts as one of the mean; where white is cut off, nothing is darkened."""
+    trainer, state = begin(Stage(steps=10, densify=None, appearance=CameraResponse(), losses={"l1": L1(1.0)}))
+    stops = torch.zeros(len(trainer.views), 3)
+    stops[1], stops[2] = -1.0, 1.0
+    light = PhotoLight(stops, torch.zeros(len(trainer.views), 8))
+    state.appearances = first_appearances(CameraResponse(), len(trainer.views), light)
+    view, color = trainer.views[0], torch.full((3, *trainer.photos[0].shape[1:]), 0.7)
+    color[:, :4] = 0.9
+
+    def compared(row, photo):
+        target, appearance = in_light(trainer.stage, state, row, Target(view, photo), color)
+        assert appearance is None
+        return target.photo
+
+    half = torch.full_like(color, 0.5)
+    assert torch.allclose(compared(0, half), half, atol=1e-6)
+    brighter = torch.tensor(from_linear(2 * linear(0.5))).float()
+    assert torch.allclose(compared(1, half), brighter.expand_as(half), atol=1e-6)
+    white = float(from_linear(np.array(0.5)))
+    found = compared(2, torch.ones_like(color))
+    assert torch.equal(found[:, :4], color[:, :4]) and 0.7 < white < 0.9
+    assert torch.allclose(found[:, 4:], torch.tensor(white).float().expand_as(found[:, 4:]), atol=1e-6)
+    learning = replace(trainer.stage, appearance=Exposure(5e-2, 5e-3))
+    state.appearances = first_appearances(learning.appearance, len(trainer.views), None)
+    target, appearance = in_light(learning, state, 1, Target(view, half), color)
+    assert appearance is not None and target.photo is half
