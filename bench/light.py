@@ -11,7 +11,7 @@ Variants of a rendered survey (shibuya-synth), with seeds that never change; bes
     cameras     two cameras, named in EXIF, with other response curves, take turns
     all         all of them
     unclipped   all of them, with half the range of exposure, and so dark that no white is cut off
-    restored    unclipped, brought back to one light by the truth: what is left is lost in 8 bits, for any model of light
+    restored    unclipped, brought back to one light by the truth: what is left is lost in 8 bits, for all models of it
 
 Light is changed as in a camera: sRGB is decoded, multiplied, limited to 1, encoded, and put through the response curve.
 Each variant is trained without and with each appearance, one run after the other, on every photograph that is not held
