@@ -242,7 +242,9 @@ def show(report: dict[str, Any], scene: Path) -> None:
     lens, more = lenses[0], f" (first of {len(lenses)} lenses)" if len(lenses) > 1 else ""
     exif = "none in EXIF" if lens["exif"] is None else f"{lens['exif']:.0f} px in EXIF"
     said = f"{exif}, {lens['photographs_alone']:.0f} by the photographs alone, {lens['final']:.0f} in the end{more}"
-    rows.append(("focal length", f"{said}; heights are {heights:.2f} times those by the photographs alone"))
+    times = f"{heights:.2f}"
+    changed = f"; heights are {times} times those by the photographs alone" if times != "1.00" else ""
+    rows.append(("focal length", f"{said}{changed}"))
     rows += rolling_rows(first["rolling_shutter"])
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")

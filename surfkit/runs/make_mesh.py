@@ -296,8 +296,7 @@ def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> dict[str, str]:
     """
     count = min(PICTURE_VIEWS, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
-    cameras = [view.camera for view in subject.views]
-    path, up = run.mesh_pictures / "above.png", up_of(mesh, cameras)
+    path, up = run.mesh_pictures / "above.png", upright(mesh, subject)
     write_picture(path, from_above(mesh, up, PICTURE_SIDE_PX))
     emit(FileWritten(path, "picture"))
     told = {}

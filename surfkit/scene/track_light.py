@@ -60,8 +60,10 @@ MEANS = 3
 """Reweighted means of the light of a point, from the median of its sights on."""
 FIRST_DEVIATION, MIN_DEVIATION = 0.05, 1e-4
 """Of what is left: before the first round, and the least that is believed."""
-SPREAD = {"stops": 3.0, "falloff": 1.0, "centre": 0.1, "curve": 0.3}
-"""Standard deviations of what is expected before any photograph is seen, around no change at all."""
+SPREAD = {"stops": 3.0, "falloff": 1.0, "centre": 0.02, "curve": 0.3}
+"""Standard deviations of what is expected before any photograph is seen, around no change at all. Lenses are centred:
+where sights hardly tell, shine that depends on the direction would move the centre far off, and darken corners that no
+sight reaches."""
 SAME_CURVE = 1e-4
 """The same of the mean curve of all photographs."""
 

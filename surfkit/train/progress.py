@@ -84,7 +84,7 @@ class TrainingDisplay:
         self.loss.add(sum(done.losses.values()))
         last = done.index == self.steps
         if done.index % PSNR_EVERY == 0 or last:
-            self.psnr.add(psnr(done.maps.need("color"), done.target.photo))
+            self.psnr.add(psnr(done.shown(), done.target.photo))
         now = time.perf_counter()
         self.pace.add(now - self.last)
         self.last = now

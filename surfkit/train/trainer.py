@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from surfkit.appearance.base import PhotoLight
 from surfkit.core.check import BadInput
@@ -17,7 +18,7 @@ from surfkit.primitives.edit import OBSERVED_EVERY, observe
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
-from surfkit.train.image_appearance import first_appearances
+from surfkit.train.image_appearance import ImageAppearance, first_appearances
 from surfkit.train.next_view import foretell
 from surfkit.train.retry_on_oom import retry_on_oom
 from surfkit.train.setup import StageSetup
@@ -29,13 +30,29 @@ from surfkit.train.watch import Stopwatch
 
 @dataclass(frozen=True)
 class CompletedStep:
-    """One step, for those who watch."""
+    """One step, for those who watch.
+
+    Attributes:
+        index: Of the step, from 1 on.
+        losses: Weighted value of each loss.
+        points: How many there are after it.
+        maps: The view as drawn, in the colours of the scene.
+        target: The view and its photograph.
+        appearance: What turns those colours into the photograph's, if the stage has any.
+    """
 
     index: int
     losses: dict[str, float]
     points: int
     maps: Maps
     target: Target
+    appearance: ImageAppearance | None = None
+
+    @torch.no_grad()
+    def shown(self) -> Tensor:
+        """(3, H, W) the render as the photograph would show it, which losses compare with the photograph."""
+        color = self.maps.need("color")
+        return color if self.appearance is None else self.appearance.shown(color)
 
 
 @dataclass(frozen=True)
@@ -93,9 +110,9 @@ class Trainer(StageSetup):
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // self.stage.sh_every))
         result = retry_on_oom(state, self.uploads, lambda: view_gradients(self, state))
         edit = update(self, state, result)
-        losses, maps, target = result.losses, result.maps, result.target
+        losses, maps, target, appearance = result.losses, result.maps, result.target, result.appearance
         del result  # what else it holds is of no use in an edit, which takes memory of its own
         if edit is not None:
             retry_on_oom(state, self.uploads, lambda: densify(self, state, edit))
         state.index, state.whole = index, True
-        return CompletedStep(index, losses, self.count(state.points), maps, target)
+        return CompletedStep(index, losses, self.count(state.points), maps, target, appearance)

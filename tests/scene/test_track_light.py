@@ -107,6 +107,32 @@ def test_noise_passes_for_no_response_curve_where_cameras_share_little():
     assert (error - error.mean(0)).std() < 0.05 and LightSpread.of(light).curve < 0.015
 
 
+@pytest.mark.parametrize("seed", [2, 5])
+def test_shine_passes_for_no_vignetting_that_is_off_the_middle(seed):
+    """As of a facade: all sights lie in a band across the picture, and colours depend on the direction a little."""
+    draw, count = np.random.default_rng(seed), 10
+    spots, light = draw.uniform([-0.6, -0.25], [0.6, 0.25], (700, 2)), linear(draw.uniform(0.15, 0.6, (700, 3)))
+    photo, point = np.nonzero(draw.random((count, 700)) < 0.45)
+    place = spots[point] + np.stack([np.linspace(-0.15, 0.15, count), draw.uniform(-0.08, 0.08, count)], 1)[photo]
+    shine = draw.normal(0, 0.4, count)[photo] * place[:, 1]  # stops
+    stops = draw.uniform(-0.6, 0.6, count)
+    left = 1 - (1 - CORNER) * (place**2).sum(1)
+    color = from_linear((light[point] * (2 ** (stops[photo] + shine) * left)[:, None]).clip(0, 1))
+    color = (color + draw.normal(0, 0.01, color.shape)).clip(0, 1)
+    found = fit_light(TrackColors(photo, point, place, color), np.zeros(count, np.int64))
+    assert np.abs(found.cameras[0, 3:5]).max() < 0.05  # 0.9 and 1.2 where the centre is free by 0.1
+    assert np.sqrt(np.square(found.stops - (stops - stops.mean())[:, None]).mean()) < 0.04  # 0.11 and 0.08
+    assert response.corner_light(found.cameras[0]) == pytest.approx(CORNER, abs=0.2)
+
+
+def test_a_lens_that_is_off_the_middle_is_found_where_points_tell():
+    colors, stops, taken_by = world()
+    seen = TrackColors(colors.photo, colors.point, colors.place + [0.08, -0.05], colors.color)
+    light = fit_light(seen, taken_by)
+    assert np.abs(light.cameras[0, 3:5] - [0.08, -0.05]).max() < 0.01
+    assert np.abs(light.stops - stops).max() < 0.02
+
+
 def test_photographs_that_share_too_little_are_known_by_their_count():
     colors, stops, taken_by = world()
     few = np.flatnonzero(colors.photo == 4)[MIN_SEEN - 4 :]

@@ -72,6 +72,16 @@ def test_each_photograph_learns_its_own_exposure(begin, tmp_path):
     assert torch.equal(again.points.params["sh0"], state.points.params["sh0"])
 
 
+def test_who_watches_gets_the_render_as_the_photograph_shows_it(begin):
+    """Training PSNR is of it: in the colours of the scene it would fall while the model gets better."""
+    trainer, state = begin(Stage(steps=40, densify=None, sh_every=1_000, appearance=Exposure(5e-2, 5e-3)))
+    done = list(trainer.run(state))[-1]
+    assert (done.shown() - done.maps.need("color")).abs().max() > 0.01 and not done.shown().requires_grad
+    plain, state = begin(Stage(steps=1, densify=None, sh_every=1_000))
+    done = next(plain.run(state))
+    assert done.shown() is done.maps.need("color")
+
+
 def test_shared_numbers_are_learned_in_every_step_and_saved(begin, tmp_path):
     stage = Stage(steps=160, densify=None, sh_every=1_000, appearance=Tint())
     _, state, trainer = trained(begin, stage, tmp_path / "c.safetensors")

@@ -1,4 +1,5 @@
 import io
+from dataclasses import replace
 
 import torch
 from rich.console import Console
@@ -40,6 +41,18 @@ def test_without_a_terminal_lines_are_plain_and_the_last_step_is_shown():
     assert lines[0].startswith("pretrain  step 1/20") and "PSNR" not in lines[0]
     for part in ("step 20/20", "it/s", "0:00 left", "12,345 points", "loss 0.5000", "  training PSNR 20.00 dB"):
         assert part in lines[1]
+
+
+def test_training_psnr_is_of_what_the_photograph_would_show():
+    class Darker:
+        def shown(self, color):
+            return color / 10
+
+    out = io.StringIO()
+    with TrainingDisplay("pretrain", 10, Console(file=out, width=40)) as display:
+        for index in range(1, 11):
+            display.show(replace(done(index), appearance=Darker()))
+    assert "training PSNR 40.00 dB" in out.getvalue()
 
 
 def test_on_a_terminal_there_is_a_bar():

@@ -7,6 +7,7 @@ Likeness needs no vocabulary from elsewhere: a photograph is summed up by a vect
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -86,12 +87,18 @@ def choose_pairs(
 
 
 def in_order(photos: Sequence[Photo]) -> list[int]:
-    """Positions of photographs as they were taken: by time where all say it, else by name; by camera first."""
+    """Positions of photographs as they were taken: by time where all say it, else by name; by camera first.
+
+    Numbers in names count as such, as cameras without EXIF often write them without zeros: 9 comes before 10.
+    """
     timed = all(photo.exif.taken for photo in photos)
-    return sorted(
-        range(len(photos)),
-        key=lambda at: (photos[at].exif.camera or "", (photos[at].exif.taken or "") if timed else "", photos[at].name),
-    )
+
+    def key(at: int) -> tuple[str, str, list[str | int]]:
+        exif, parts = photos[at].exif, re.split(r"(\d+)", photos[at].name)  # every other part is a number
+        numbered = [int(part) if place % 2 else part for place, part in enumerate(parts)]
+        return exif.camera or "", (exif.taken or "") if timed else "", numbered
+
+    return sorted(range(len(photos)), key=key)
 
 
 def sequence(order: Sequence[int], steps: int) -> set[Pair]:

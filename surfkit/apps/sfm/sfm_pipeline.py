@@ -26,7 +26,7 @@ from surfkit.apps.sfm.focal import (
     weighed,
     with_focals_held,
 )
-from surfkit.apps.sfm.georeference import ASSUMED_M, NoSimilarity, Placement, centres_of
+from surfkit.apps.sfm.georeference import NoSimilarity, Placement, centres_of
 from surfkit.apps.sfm.gravity_alignment import points_of, turn_upright, up_of
 from surfkit.apps.sfm.ground_control import ControlResiduals, doubts, place_by_points
 from surfkit.apps.sfm.inspect_photos import PHOTOGRAPHS_FILE, Photo, known_photographs
@@ -34,6 +34,7 @@ from surfkit.apps.sfm.map_choice import PositionHypothesis, decide, heights_name
 from surfkit.apps.sfm.mapping import MIN_MODEL_PHOTOS, map_photographs, read_model
 from surfkit.apps.sfm.mask_export import deliver_masks
 from surfkit.apps.sfm.match_photos import compare
+from surfkit.apps.sfm.position_doubts import position_doubts
 from surfkit.apps.sfm.positions import Positions, settle
 from surfkit.apps.sfm.rolling_shutter import RollingShutter, correct_once, refuse_timeless, still
 from surfkit.apps.sfm.row_motion import RowMotion
@@ -239,7 +240,8 @@ class SfmPreparation:
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
             return _levelled(model, photos), None, None
         model.transform(_sim3d(where.similarity))
-        _name_wrong(where)
+        for doubt in position_doubts(where, centres_of(model), photos):
+            emit(Warned(doubt))
         if where.plan:
             emit(
                 Warned(
@@ -350,26 +352,6 @@ def _alike(before: Sequence[Photo], photos: Sequence[Photo]) -> list[tuple[Photo
     """Photographs of before, and those of the same names."""
     now = {photo.name: photo for photo in photos}
     return [(photo, now[photo.name]) for photo in before if photo.name in now]
-
-
-def _name_wrong(where: Placement) -> None:
-    """Say which positions are left out, and how many count though they contradict others."""
-    if where.drifting:
-        said = f"{where.drifting} of {len(where.names)} positions contradict the others by up to {ASSUMED_M:g} m"
-        emit(Warned(f"{said}; they state no accuracy, are taken for GPS without corrections, and count"))
-    wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
-    far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
-    if len(wrong) == 1:
-        by = f"{_metres(far[0])} m"
-        emit(Warned(f"the position of {wrong[0]!r} is {by} from where the others put it, and is left out"))
-    elif wrong:
-        by = " to ".join(dict.fromkeys(_metres(value) for value in (far.min(), far.max()))) + " m"
-        emit(Warned(f"{len(wrong)} positions are {by} from where the others put them, and are left out: {few(wrong)}"))
-
-
-def _metres(value: float) -> str:
-    """A distance to 0.1 m, and of 10 m and more to 1 m."""
-    return f"{value:.1f}" if value < 10 else f"{value:,.0f}"
 
 
 def read_drawn(scene: Path) -> Any:

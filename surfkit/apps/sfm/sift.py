@@ -21,14 +21,25 @@ BYTES_PER_PIXEL = 160
 """That SIFT takes with the photograph doubled in size first: five levels of an octave and as many differences."""
 MAX_SIFT_BYTES = 2 << 30
 """Of all threads together."""
+FAINT_RANGE = 128.0
+"""Grey levels, of 256, between the darkest and the brightest thousandth of a picture, below which it is stretched."""
+DARKEST, BRIGHTEST = 0.001, 0.999
+"""Shares of the pixels that are darker than the two."""
+MOST_STRETCH = 8.0
+"""Beyond, the steps of 8 bits would pass for features."""
 
 
 @dataclass(frozen=True)
 class SIFT(FeatureExtractor):
-    """SIFT by pycolmap (Lowe, IJCV 2004; RootSIFT), on the CPU; on a GPU if pycolmap was built with CUDA."""
+    """SIFT by pycolmap (Lowe, IJCV 2004; RootSIFT), on the CPU; on a GPU if pycolmap was built with CUDA.
+
+    Faint photographs, as those under water, in haze or at dusk, are stretched to the full range of grey first: what
+    SIFT takes for a feature must have a contrast that is a share of that range.
+    """
 
     descriptors: ClassVar[str] = "sift"
     in_torch: ClassVar[bool] = False
+    version: ClassVar[int] = 2
 
     def at_once(self, pixels: int) -> int:
         """See `FeatureExtractor.at_once`."""
@@ -46,12 +57,22 @@ class SIFT(FeatureExtractor):
             options.max_image_size = max(photo.shape)
             options.sift.max_num_features = most
             extractor = engine.FeatureExtractor.create(options, engine.Device.auto)
-            grey = photo.float().mean(0).round().byte().numpy()
+            grey = stretched(photo.float().mean(0).numpy()).round().astype(np.uint8)
             found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
             keypoints = np.array(engine.keypoints_to_matrix(found), np.float32).reshape(-1, 4)
             return Features(keypoints, np.array(descriptors.data, np.uint8).reshape(-1, 128))
 
         return find
+
+
+def stretched(grey: np.ndarray) -> np.ndarray:
+    """(H, W) float32 grey levels in [0, 255]: over the full range where they fill less than half of it, else as they
+    are; by one gain and offset, so that features keep their places and their order."""
+    low, high = (float(level) for level in np.quantile(grey, (DARKEST, BRIGHTEST)))
+    if high - low >= FAINT_RANGE:
+        return grey
+    gain = min(255 / max(high - low, 1.0), MOST_STRETCH)
+    return ((grey - (low + high) / 2) * gain + 127.5).clip(0, 255)
 
 
 @dataclass(frozen=True)

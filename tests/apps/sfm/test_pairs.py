@@ -130,6 +130,12 @@ def test_vlad_is_of_unit_length_and_knows_its_cluster():
     assert not vlad(np.zeros((0, 2)), words).any()
 
 
+def test_numbers_in_names_without_zeros_count_as_numbers():
+    names = ["Right/run1_2.png", "Left/run1_10.png", "Left/run1_9.png", "Left/run1_1.png", "Left/run1.png"]
+    order = in_order([Photo(name, (0, 0)) for name in names])
+    assert [names[at] for at in order] == [names[at] for at in (4, 3, 2, 1, 0)]
+
+
 @pytest.mark.parametrize("way", ["exhaustive", "gps", "sequence", "retrieval"])
 def test_few_photographs_in_every_way(way):
     for count in (0, 1, 2, 3):
