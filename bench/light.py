@@ -210,7 +210,6 @@ def costs(rounds: int) -> dict[str, dict[str, float]]:
     for width, height in ((1600, 1200), (800, 608), (400, 304)):
         splats, camera = city(width=width, height=height)
         photo = torch.rand(3, height, width)
-        color = torch.rand(3, height, width).requires_grad_()
 
         def step(splats=splats, camera=camera, photo=photo) -> None:
             render = NativeRasterizer().render(splats, camera, 0.2)
@@ -218,8 +217,8 @@ def costs(rounds: int) -> dict[str, dict[str, float]]:
             loss = 0.8 * (shown - photo).abs().mean() + 0.2 * (1 - ssim(shown, photo))
             render.backward(Maps(color=torch.autograd.grad(loss, shown)[0]))
 
-        def respond(color=color, camera=camera, photo=photo) -> None:
-            torch.autograd.grad(CameraResponse()(numbers, color, camera), color, photo)
+        def respond(camera=camera, photo=photo) -> None:
+            CameraResponse().of_scene(numbers, photo, camera)
 
         row = {"step": cpu_seconds(step, rounds), "camera-response": cpu_seconds(respond, rounds)}
         found[f"{width} x {height}"] = {name: round(value, 5) for name, value in row.items()}
