@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import Tensor
 
+from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
 from surfkit.io.datasets.depth_prior import DepthAlignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.io.datasets.panoramas import points_remedy
 from surfkit.io.datasets.read import observations
 from surfkit.runs.folder import Run
-from surfkit.scene.scene import Scene
+from surfkit.runs.photo_light import light_of
+from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel, StartInput
 from surfkit.train.data_cache import TrainingData, needs_normals, needs_priors, scale_band
 
@@ -47,11 +52,43 @@ class InitialPointBuilder:
             )
         own = torch.Generator().manual_seed(self.run.recipe.seed)
         try:
-            known = StartInput(scene, given.photos, given.masks, priors, own)
+            known = StartInput(scene, self.photos(), given.masks, priors, own)
             return start.model(self.run.recipe.primitive, known, generator)
         finally:
             if priors is not None:
                 priors.close()
+
+    def photos(self) -> Sequence[Tensor]:
+        """(3, H, W) uint8 photographs, in the light of the scene if the appearance of the first stage tells it."""
+        model = self.run.recipe.pretrain.appearance
+        if model is None or not model.needs_light or (light := light_of(self.run, self.scene.train)) is None:
+            return self.given.photos
+        return PhotosInOneLight(self.given.photos, self.scene.train, model, model.begin_with(light))
+
+
+@dataclass(frozen=True)
+class PhotosInOneLight(Sequence[Tensor]):
+    """Photographs in the light of the scene, each when it is looked at; as they are, if the model cannot tell.
+
+    Attributes:
+        given: (3, H, W) uint8 each.
+        views: Their views.
+        model: What their numbers mean.
+        numbers: (V, ...) of each.
+    """
+
+    given: Sequence[Tensor]
+    views: Sequence[View]
+    model: Appearance
+    numbers: Tensor
+
+    def __len__(self) -> int:
+        return len(self.given)
+
+    def __getitem__(self, at: Any) -> Any:
+        photo = self.given[at]
+        found = self.model.of_scene(self.numbers[at], photo / 255, self.views[at].camera)
+        return photo if found is None else (255 * found[0]).round().to(torch.uint8)
 
 
 def align_priors(run: Run, scene: Scene, begun: bool) -> DepthAlignment | None:

@@ -20,11 +20,13 @@ from surfkit.runs.folder import Run
 from surfkit.runs.photo_light import LightRecord, _photo_light, held_out_response, light_of, recorded
 from surfkit.runs.pipeline import load_run, loaded, opened, run
 from surfkit.runs.recipe import Recipe
+from surfkit.runs.start import InitialPointBuilder
 from surfkit.scene.photos import view_photo
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.scene.track_light import TrackColors, TrackLight
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
+from surfkit.train.data_cache import TrainingData
 from surfkit.train.refine.light_gaussian import DistilSH, PruneAndRecover
 from surfkit.train.stage import Stage
 
@@ -66,6 +68,19 @@ def test_a_run_finds_exposures_first_and_resumes_with_the_same_bits(data, recipe
     assert list(record.cameras) == ["camera 1"] and record.cameras["camera 1"].curve == (0, 0, 0)
     value, mean = states[0].appearances["value"], record.cameras["camera 1"].mean
     assert torch.allclose(value[:, :3].double(), torch.from_numpy(stops + mean)) and value.shape == (len(stops), 11)
+
+
+def test_points_begin_with_colours_in_one_light(data, recipe, tmp_path):
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
+    scene = read(data)
+    given = TrainingData([view_photo(view) for view in scene.train], None, None)
+    builder = InitialPointBuilder(Run(tmp_path / "run", recipe, data), scene, given, None)
+    raw, even = (torch.stack([photo.float().mean() for photo in each]) for each in (given.photos, builder.photos()))
+    assert (raw[::2].mean() / raw[1::2].mean()).item() > 1.2  # a stop between them
+    assert (even[::2].mean() / even[1::2].mean()).item() == pytest.approx(1, abs=0.05)
+    plain = replace(recipe, pretrain=replace(recipe.pretrain, appearance=None))
+    builder = InitialPointBuilder(Run(tmp_path / "run", plain, data), scene, given, None)
+    assert builder.photos() is given.photos
 
 
 def test_blocks_have_the_numbers_of_the_whole_scene(data, recipe, tmp_path):
