@@ -109,7 +109,7 @@ def needed_light(run: Run, scene: Scene) -> LightRecord | None:
         if not is_wanted and not (spread := LightSpread.of(light)).is_uneven:
             say(f"light of the photographs: {spread}; that is little, so colours stay as they are")
             return LightRecord({}, {}, 0.0, spread, is_used=False)
-    say(f"light of the photographs: {LightSpread.of(light)}; colours are compared in the light of each")
+    say(f"light of the photographs: {LightSpread.of(light)}; all are compared in one light")
     if unknown := [view.name for view, seen in zip(scene.train, light.seen, strict=True) if seen < MIN_SEEN]:
         emit(
             Warned(
