@@ -178,7 +178,8 @@ def check_appearance(appearance: Appearance) -> None:
     """An appearance model begins with numbers that change nothing, gives finite colours that are differentiable in
     colours and, if it learns them, in numbers, learns at a rate of 0 or more, and folds its mean into points of the
     same columns. So it is with numbers that all photographs share, if there are any. A model that needs the light of
-    photographs begins with it: no change of light is no change of colours.
+    photographs begins with it: no change of light is no change of colours. One that knows the way back learns nothing,
+    and what it makes of the colours of a photograph leads to these again.
 
     Args:
         appearance: To check.
@@ -220,6 +221,7 @@ def check_appearance(appearance: Appearance) -> None:
         grad = torch.autograd.grad(shown.square().sum(), leaf, retain_graph=True, allow_unused=True)[0]
         assert grad is not None and grad.any(), f"{name} gives no gradient by the {what}"
         assert torch.isfinite(grad).all(), f"{name}: the gradient by the {what} is not finite"
+    _check_way_back(name, appearance, joined(moved, common).detach(), shown.detach().clamp(0, 1), camera, any(rates))
     params = Surfel2D(sh_degree=1).init(cloud(), torch.Generator().manual_seed(0))
     with unchanged(f"{name}.folded", numbers=numbers, params=params):
         folded = appearance.folded(numbers, params)
@@ -229,6 +231,22 @@ def check_appearance(appearance: Appearance) -> None:
     for key, value in folded.items():
         close = torch.allclose(value, params[key], atol=1e-5)
         assert close, f"{name}.folded changes {key!r} for numbers that change no photograph"
+
+
+def _check_way_back(
+    name: str, appearance: Appearance, numbers: Tensor, photo: Tensor, camera: Camera, learns: bool
+) -> None:
+    """`of_scene`, if the model has one, of a photograph (3, H, W)."""
+    found = appearance.of_scene(numbers, photo, camera)
+    if found is None:
+        return
+    assert not learns, f"{name}.of_scene: its numbers are learned, and photographs in the light of the scene teach none"
+    scene, least = found
+    assert scene.shape == least.shape == photo.shape, f"{name}.of_scene gives shapes {[tuple(t.shape) for t in found]}"
+    assert least.dtype == torch.bool, f"{name}.of_scene gives {least.dtype} where the scene may be brighter, not bool"
+    clear = ~least & (scene < 1)
+    off = (appearance(numbers, scene, camera) - photo)[clear].abs()
+    assert len(off) and off.max() < 0.02, f"{name}.of_scene: the way back does not lead to the photograph"
 
 
 def check_depth_estimator(estimator: DepthEstimator) -> None:

@@ -73,8 +73,8 @@ class ImageAppearance:
         return cls(stage.appearance, state.appearances, at, rate, camera)
 
     def of_scene(self, photo: Tensor) -> tuple[Tensor, Tensor] | None:
-        """See `Appearance.of_scene`; `photo` is (3, H, W)."""
-        if len(self.leaves) > 1:
+        """See `Appearance.of_scene`; `photo` is (3, H, W). None where numbers are learned: this way teaches none."""
+        if self.rate > 0 or len(self.leaves) > 1:
             return None
         found = self.model.of_scene(self.leaves[0].detach().to(photo), photo, self.camera)
         if found is not None:

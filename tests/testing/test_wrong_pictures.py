@@ -199,6 +199,16 @@ class Starts(CameraResponse):
         return CameraResponse.begin_with(self, light) + 0.1
 
 
+class Returns(Exposure):
+    def of_scene(self, numbers, photo, camera):
+        return photo, photo > 2
+
+
+class Strays(CameraResponse):
+    def of_scene(self, numbers, photo, camera):
+        return 0.9 * photo, photo > 2
+
+
 class Spills(Exposure):
     def folded(self, numbers, params):
         params["sh0"] += 0.1
@@ -237,6 +247,8 @@ class Folds(Shares):
         (Unlearned(), "Unlearned gives no gradient by the numbers"),
         (Idles(), "Idles: the learning rate is 0 throughout, so nothing is learned"),
         (Starts(), "Starts.begin_with, of light that did not change"),
+        (Returns(), "Returns.of_scene: its numbers are learned"),
+        (Strays(), "Strays.of_scene: the way back does not lead to the photograph"),
         (Reverses(), "Reverses: .* -0.00.*0 or more"),
         (Spills(), r"Spills.folded changed .*params\['sh0'\]"),
         (Shares(), "Shares gives no gradient by the shared numbers"),

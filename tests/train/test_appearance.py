@@ -184,6 +184,8 @@ def test_colours_are_compared_in_the_light_of_the_scene_where_the_way_back_is_kn
     found = compared(2, torch.ones_like(color))
     assert torch.equal(found[:, :4], color[:, :4]) and 0.7 < white < 0.9
     assert torch.allclose(found[:, 4:], torch.tensor(white).float().expand_as(found[:, 4:]), atol=1e-6)
+    learned = ImageAppearance(CameraResponse(), state.appearances, 0, 0.1, view.camera)
+    assert learned.of_scene(half) is None
     learning = replace(trainer.stage, appearance=Exposure(5e-2, 5e-3))
     state.appearances = first_appearances(learning.appearance, len(trainer.views), None)
     target, appearance = in_light(learning, state, 1, Target(view, half), color)
