@@ -24,12 +24,11 @@ from surfkit.scene.response import (
     curved,
     falloff,
     sensor_scale,
+    uncurved,
 )
 
 WHITE = 250 / 255
 """From here on white may have been cut off."""
-FINE = 4096
-"""Values of a response curve between which it is straight."""
 
 
 @dataclass(frozen=True)
@@ -92,20 +91,14 @@ class CameraResponse(Appearance):
         back = torch.cat([-stops, -of_camera[FALLOFF], of_camera[CENTRE], torch.zeros_like(of_camera[CURVE])])
         before = photo
         if of_camera[CURVE].any():
-            before = inverse_table(of_camera[CURVE]).to(photo)[(255 * photo).round().long()]
+            table = uncurved(np.arange(256) / 255, of_camera[CURVE].cpu().double().numpy())
+            before = torch.from_numpy(table).to(photo)[(255 * photo).round().long()]
         color = self(back, before, camera)
         return color, (photo >= WHITE) & (color < photo)
 
     def folded(self, numbers: Tensor, params: Columns) -> Columns:
         """The parameters as they are: the scene has the colours of the mean photograph already."""
         return params
-
-
-def inverse_table(curve: Tensor) -> Tensor:
-    """(256,) values that a response curve, (3,), maps to those of 8 bits."""
-    fine = np.linspace(0, 1, FINE)
-    curves = curved(fine, curve.cpu().double().numpy())
-    return torch.from_numpy(np.interp(np.arange(256) / 255, curves, fine))
 
 
 def sensor_axes(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:

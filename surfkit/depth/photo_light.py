@@ -9,15 +9,13 @@ from torch import Tensor
 from surfkit.depth.base import DepthInput
 from surfkit.depth.cost_volume import PosedImage
 from surfkit.scene.camera import Camera
-from surfkit.scene.response import CENTRE, CURVE, curved, falloff, mean_falloff, sensor_scale
+from surfkit.scene.response import CENTRE, CURVE, falloff, mean_falloff, sensor_scale, uncurved
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.scene.track_light import MIN_SEEN, fit_light, rows_of, track_colors
 
 WHITE_SHARE, MOST_STRETCH = 0.005, 4.0
 """Grey values of a photograph are stretched so that so large a share of them is white, by this factor at most: noise of
 the windows, and differences within them, are then as large in dark photographs as in bright ones."""
-TABLE_VALUES = 4096
-"""Of the table of a response curve: sixteen for each step of 8 bits."""
 
 
 class EvenLight:
@@ -51,8 +49,7 @@ class EvenLight:
         x, y = ((np.arange(side) + 0.5 - middle) * scale - centre for side, middle, centre in sides)
         lost = falloff(numbers, x**2 + y[:, None] ** 2) - mean_falloff(numbers, camera)
         stops = self.stops[number].mean() if values.ndim == 2 else self.stops[number][:, None, None]
-        fine = np.linspace(0, 1, TABLE_VALUES)
-        light = linear(np.interp(values.cpu().numpy(), curved(fine, numbers[CURVE]), fine))
+        light = linear(uncurved(values.cpu().numpy(), numbers[CURVE]))
         return torch.from_numpy(from_linear(light * np.exp2(lost - stops))).to(values)
 
     def picture(self, taken: PosedImage, number: int) -> PosedImage:

@@ -21,6 +21,8 @@ MAX_SLOPE_CHANGE = 0.9
 """A response curve is nowhere steeper than 1.9 times the standard one, and nowhere flatter than 0.1 times."""
 MEAN_STEPS = 64
 """Places along each side of a picture, or around it, of which a mean is taken."""
+TABLE_VALUES = 4096
+"""Of the table by which a response curve is turned round: sixteen for each step of 8 bits."""
 KNEE = 0.04045
 """sRGB is straight up to here, and a power of the light above (IEC 61966-2-1)."""
 
@@ -58,6 +60,12 @@ def corner_light(values: np.ndarray) -> float:
 def curved(encoded: Any, curve: Any) -> Any:
     """What a response curve makes of values in [0, 1]; `curve` has its three numbers, (3, ...)."""
     return encoded + sum(number * term for number, term in zip(curve, curve_terms(encoded), strict=True))
+
+
+def uncurved(values: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """(...) values in [0, 1] that a response curve maps to these; `curve` has its three numbers, (3,)."""
+    fine = np.linspace(0, 1, TABLE_VALUES)
+    return np.interp(values, curved(fine, curve), fine)
 
 
 def curve_slope(encoded: Any, curve: Any) -> Any:

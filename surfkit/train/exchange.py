@@ -168,8 +168,9 @@ class DividedRender(Render):
     def _sums(self, total: Maps, chosen: Maps | None, absolute: bool) -> list[Tensor]:
         """(N, ...) gradients by what the strips were sent, and the signals; what leads to them is freed."""
         here = self._drawn.backward(total, chosen, absolute)
-        parts = [*list(here.tensors().values())[:5], here.signal, *([] if here.chosen is None else [here.chosen])]
-        del here
+        colored = [value for name, value in here.tensors().items() if name != "sh_rest"]  # strips get colours alone
+        parts = [*colored, here.signal, *([] if here.chosen is None else [here.chosen])]
+        del here, colored
         return [self._exchange.returned(parts.pop(0)) for _ in range(len(parts))]
 
     def _pixels(self, rank: int) -> slice:
