@@ -69,6 +69,7 @@ from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
+from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.reprojection import Reprojection
@@ -224,6 +225,7 @@ __all__ = [
     "Optimizer",
     "OptimizerInput",
     "Partition",
+    "PatchDepth",
     "PatchMatch",
     "PhotoLight",
     "PhotoSkipped",

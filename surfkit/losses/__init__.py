@@ -7,6 +7,7 @@ from surfkit.core.registry import Component
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
+from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.reprojection import Reprojection
@@ -23,6 +24,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "normal": NormalConsistency,
         "distortion": Distortion,
         "depth": DepthRegression,
+        "patch-depth": PatchDepth,
         "normal-prior": NormalPrior,
         "reprojection": Reprojection,
         "warped-patches": WarpedPatches,

@@ -20,6 +20,7 @@ from surfkit.depth.filled import Filled
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
+from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
@@ -265,6 +266,7 @@ SURFACE_TABLE = Table(
         Row("+ normal consistency where stereo knows nothing", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency everywhere", {"pretrain.losses.normal": NORMALS}, kept=False),
+        Row("+ depth patch by patch (GeoSVR)", {"pretrain.losses.patch-depth": PatchDepth()}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
