@@ -189,19 +189,22 @@ def probe(job: ProbeJob, told: Callable[[int, int], None] | None = None) -> Prob
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(theirs, pickle.dumps(job)), daemon=True)
-    process.start()
-    theirs.close()
     found: list[ProbeStart | SegmentCosts | ProbeOutput | str] = []
-    try:
-        with suppress(EOFError):
-            while True:
-                found.append(ours.recv())
-                if told is not None:
-                    told(sum(isinstance(one, SegmentCosts) for one in found), len(job.parts))
-        process.join()
-    finally:
-        process.kill()
+    with tempfile.TemporaryDirectory(prefix="surfkit-doctor-") as folder:
+        # As a file: a process that dies before it has read its arguments leaves `start` waiting if they fill a pipe.
+        Path(folder, "job").write_bytes(pickle.dumps(job))
+        process = context.Process(target=_work, args=(theirs, folder), daemon=True)
+        process.start()
+        theirs.close()
+        try:
+            with suppress(EOFError):
+                while True:
+                    found.append(ours.recv())
+                    if told is not None:
+                        told(sum(isinstance(one, SegmentCosts) for one in found), len(job.parts))
+            process.join()
+        finally:
+            process.kill()
     failure = next((one for one in found if isinstance(one, str)), None)
     if failure is None and process.exitcode:
         killed = process.exitcode == -signal.SIGKILL
@@ -214,13 +217,13 @@ def probe(job: ProbeJob, told: Callable[[int, int], None] | None = None) -> Prob
     )
 
 
-def _work(connection: Connection, job: bytes) -> None:
+def _work(connection: Connection, folder: str) -> None:
     """What the new process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     try:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), 2)  # what goes wrong is told through the connection
-        for found in measure(pickle.loads(job)):
+        for found in measure(pickle.loads(Path(folder, "job").read_bytes())):
             connection.send(found)
     except Exception as error:  # whatever it is, the parent has to know
         connection.send(f"{type(error).__name__}: {' '.join(str(error).split())}")

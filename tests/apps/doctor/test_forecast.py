@@ -4,7 +4,7 @@ import os
 import shutil
 import signal
 from dataclasses import replace
-from multiprocessing import active_children
+from multiprocessing import active_children, spawn
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -282,6 +282,15 @@ def test_a_probe_that_is_killed_says_so(farm, tmp_path, forked_probe):
     empty = SparsePoints(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
     broken = probe(replace(job, scene=replace(job.scene, cloud=empty)))
     assert "BadInput: the scene has no sparse points" in broken.failure and broken.taken == ()
+
+
+def test_a_probe_that_dies_before_it_reads_its_job_says_so(farm, tmp_path, monkeypatch):
+    """The job is larger than a pipe, into which nobody would write for ever."""
+    job = tiny(farm, tmp_path)
+    cloud = SparsePoints(torch.zeros(100_000, 3), torch.zeros(100_000, 3, dtype=torch.uint8))
+    monkeypatch.setattr(spawn, "get_executable", lambda: os.fsencode(shutil.which("false") or ""))
+    found = probe(replace(job, scene=replace(job.scene, cloud=cloud)))
+    assert found.started is None and found.failure == "it crashed"
 
 
 @pytest.mark.parametrize(
