@@ -29,6 +29,7 @@ class Needs:
         steps: Optimisation steps of all stages, those that several trials share once.
         alone: Steps if each trial computed all its stages itself.
         stages: Stages that make checkpoints, each counted once.
+        longest: Steps of the trial that has most.
     """
 
     runs: int
@@ -36,6 +37,7 @@ class Needs:
     steps: int
     alone: int
     stages: int
+    longest: int = 0
 
 
 def foretell(plan: AblationPlan, left: Sequence[Trial], probe_steps: int) -> None:
@@ -50,7 +52,7 @@ def foretell(plan: AblationPlan, left: Sequence[Trial], probe_steps: int) -> Non
         if not examined.diagnosis.sound:
             say(f"forecast: none for {data.path}; `{shlex.join(['surfkit', 'doctor', str(data.path)])}` says why")
             continue
-        probe = Probe(probe_steps, plan.max_points, device=plan.device, out=plan.out)
+        probe = Probe(probe_steps, plan.max_points, device=plan.device, out=plan.out, threads=plan.workers.threads_each)
         found, findings = forecast(data, first.recipe, examined, probe)
         if found is None:
             say(f"forecast: none for {data.path}: {'; '.join(finding.text for finding in findings)}")
@@ -79,10 +81,13 @@ def lines(plan: AblationPlan, name: str, needs: Needs, recipe: Recipe, found: Re
     included = f"with {'depth maps and ' * maps}meshes" if meshes else f"{'with depth maps, ' * maps}without meshes"
     less = f", {needs.alone - needs.steps:,} fewer as rows share stages" if needs.alone > needs.steps else ""
     at_once = plan.workers.at_once or 1
-    shared_by = f" of computing, {at_once} rows at a time" if at_once > 1 else ""
+    last = needs.longest * each + aside  # no row is divided
+    wall = max(seconds / min(at_once, max(1, needs.runs)), last)
+    shared_by = f" ({duration(seconds)} of computing, {at_once} rows at a time)" if at_once > 1 else ""
+    likely = "" if found.points_known else f" with about {found.points:,} points, which are a rule of thumb"
     yield (
-        f"{name}: {needs.runs} runs, {needs.steps:,} optimisation steps{less}; about {duration(seconds)}{shared_by} "
-        f"{included}, at {1000 * each:.0f} ms a step; about {size(disk)} of disk, {size(free)} are free"
+        f"{name}: {needs.runs} runs, {needs.steps:,} optimisation steps{less}; about {duration(wall)}{shared_by} "
+        f"{included}, at {1000 * each:.0f} ms a step{likely}; about {size(disk)} of disk, {size(free)} are free"
     )
     if needs.others:
         yield f"{name}: not included: {needs.others} runs of methods that do not optimise splats"
@@ -94,16 +99,17 @@ def needs_of(trials: Sequence[Trial], done: set[Key], shared: bool) -> Needs:
     """What trials on one data set have to compute, without what is done."""
     counted: set[Key] = set(done)
     runs = [trial for trial in trials if trial.recipe.has_stages]
-    steps = alone = stages = 0
+    steps = alone = stages = longest = 0
     for trial in runs:
-        keys = keys_of(trial)
+        keys, before = keys_of(trial), steps
         for name, count in stage_steps(trial.recipe).items():
             alone += count
             if shared and keys[name] in counted:
                 continue
             counted.add(keys[name])
             steps, stages = steps + count, stages + 1
-    return Needs(len(runs), len(trials) - len(runs), steps, alone, stages)
+        longest = max(longest, steps - before)
+    return Needs(len(runs), len(trials) - len(runs), steps, alone, stages, longest)
 
 
 def stage_steps(recipe: Recipe) -> dict[str, int]:

@@ -11,12 +11,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from needs import needs_native
 from two_blocks import data, recipe
 
-from surfkit.apps.ablation_forecast import foretell, needs_of, stage_steps
+from surfkit.apps import ablation_forecast
+from surfkit.apps.ablation_forecast import foretell, lines, needs_of, stage_steps
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
@@ -263,6 +265,22 @@ def test_a_forecast_counts_shared_stages_once(table, data, tmp_path, capsys, for
     foretell(plan, every, 5)
     said = capsys.readouterr().err
     assert "4 runs, 60 optimisation steps, 84 fewer" in said and "of disk" in said
+    assert needs.longest == 36
+
+
+def test_a_forecast_measures_with_the_threads_of_a_worker_and_divides_by_them(table, data, tmp_path, monkeypatch):
+    pool, asked = Pool(workers=2, threads=3), []
+    monkeypatch.setattr(ablation_forecast, "forecast", lambda *given: (asked.append(given[3]), (None, []))[1])
+    plan = AblationPlan(table, (data,), tmp_path, device="cpu", workers=pool)
+    foretell(plan, trials(plan), 5)
+    assert [one.threads for one in asked] == [3]
+    found = SimpleNamespace(step_seconds=(0.5,), seconds=600.0 + 0.5 * 12, mesh=None, depth_seconds=0.0, run_bytes=1)
+    found = SimpleNamespace(**vars(found), room=SimpleNamespace(run_bytes=9), points_known=False, points=5_000)
+    needs = replace(needs_of(trials(plan), set(), True), runs=4, steps=1_200, longest=100)
+    said = next(lines(plan, "here", needs, trials(plan)[0].recipe, found))
+    assert "about 25 min (50 min of computing, 2 rows at a time)" in said and "with about 5,000 points" in said
+    said = next(lines(plan, "here", replace(needs, longest=3_600), trials(plan)[0].recipe, found))
+    assert "about 40 min (50 min of" in said  # no row is divided
 
 
 if __name__ == "__main__":

@@ -58,7 +58,8 @@ def look(
 ) -> list[Finding]:
     """Everything that is missing, or is not what it should be, for some scenes and rows."""
     if not root.is_dir():
-        return [Finding("", str(root), "no such folder", "name with --root the one that has the data of the benchmark")]
+        what = "a file, not a folder" if root.exists() else "no such folder"
+        return [Finding("", str(root), what, "name with --root the one that has the data of the benchmark")]
     found: list[Finding] = []
     for scene in scenes:
         found += _of_scene(protocol, root, scene, contenders)
@@ -99,7 +100,10 @@ def _faults(root: Path, needed: Needed) -> Iterator[str]:
     """What is wrong with one file or folder."""
     path = root / needed.path
     if not path.exists():
-        yield "missing"
+        deeper = next(iter(sorted(root.glob(f"*/{needed.path}"))), None)
+        yield (
+            "missing" if deeper is None else f"missing, but {deeper} is there: move it, or name its folder with --root"
+        )
     elif needed.pictures is not None:
         yield from _of_pictures(path, needed)
     elif needed.points is not None or needed.faces is not None:

@@ -55,6 +55,7 @@ class ProbePlan:
         cache: As for `surfkit train --cache`.
         device: Where to compute.
         out: Where the run folder will be.
+        threads: That the run will have; 0 for as many as torch uses.
     """
 
     steps: int = 50
@@ -62,6 +63,7 @@ class ProbePlan:
     cache: str = "auto"
     device: Device = "auto"
     out: Path = Path("runs")
+    threads: int = 0
 
 
 def forecast(
@@ -96,7 +98,7 @@ def forecast(
         held_back = within(parts, min(MAX_PROBE_POINTS, int(0.4 * room.memory_bytes / PROBE_POINT_BYTES)))
         wanted = load.view_bytes > 0 and needs_priors(recipe.pretrain.losses)
         priors = wanted and bool(_with_maps(data, examined, recipe))
-        job = ProbeJob(recipe, scene, held_back, plan.steps, MAX_PROBE_S, priors, plan.device)
+        job = ProbeJob(recipe, scene, held_back, plan.steps, MAX_PROBE_S, priors, plan.device, plan.threads)
         probed = probe(job, None if told is None else lambda done, all_: told("probe", done, all_))
     if probed.failure is not None or probed.written is None:
         return None, [_failed(probed, held_back)]

@@ -45,6 +45,8 @@ from surfkit.train.trainer import Trainer
 
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""
+PART_S = 0.4
+"""Cheap steps are taken for so long in each part, since a few of them tell little of the others."""
 EDITED = 0.05
 """Share of the points that go, and of those that come, in the edit of each part: an edit holds the points several times
 over."""
@@ -95,6 +97,7 @@ class ProbeJob:
         seconds: After so long, a part ends early.
         priors: Whether the losses are to be given depth priors.
         device: Where to compute.
+        threads: Of the run; 0 for as many as torch uses.
     """
 
     recipe: Recipe
@@ -104,6 +107,7 @@ class ProbeJob:
     seconds: float
     priors: bool
     device: Device = "auto"
+    threads: int = 0
 
 
 @dataclass(frozen=True)
@@ -189,19 +193,22 @@ def probe(job: ProbeJob, told: Callable[[int, int], None] | None = None) -> Prob
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(theirs, pickle.dumps(job)), daemon=True)
-    process.start()
-    theirs.close()
     found: list[ProbeStart | SegmentCosts | ProbeOutput | str] = []
-    try:
-        with suppress(EOFError):
-            while True:
-                found.append(ours.recv())
-                if told is not None:
-                    told(sum(isinstance(one, SegmentCosts) for one in found), len(job.parts))
-        process.join()
-    finally:
-        process.kill()
+    with tempfile.TemporaryDirectory(prefix="surfkit-doctor-") as folder:
+        # As a file: a process that dies before it has read its arguments leaves `start` waiting if they fill a pipe.
+        Path(folder, "job").write_bytes(pickle.dumps(job))
+        process = context.Process(target=_work, args=(theirs, folder), daemon=True)
+        process.start()
+        theirs.close()
+        try:
+            with suppress(EOFError):
+                while True:
+                    found.append(ours.recv())
+                    if told is not None:
+                        told(sum(isinstance(one, SegmentCosts) for one in found), len(job.parts))
+            process.join()
+        finally:
+            process.kill()
     failure = next((one for one in found if isinstance(one, str)), None)
     if failure is None and process.exitcode:
         killed = process.exitcode == -signal.SIGKILL
@@ -214,13 +221,16 @@ def probe(job: ProbeJob, told: Callable[[int, int], None] | None = None) -> Prob
     )
 
 
-def _work(connection: Connection, job: bytes) -> None:
+def _work(connection: Connection, folder: str) -> None:
     """What the new process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     try:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), 2)  # what goes wrong is told through the connection
-        for found in measure(pickle.loads(job)):
+        job: ProbeJob = pickle.loads(Path(folder, "job").read_bytes())
+        if job.threads:
+            torch.set_num_threads(job.threads)
+        for found in measure(job):
             connection.send(found)
     except Exception as error:  # whatever it is, the parent has to know
         connection.send(f"{type(error).__name__}: {' '.join(str(error).split())}")
@@ -285,9 +295,11 @@ def _taken(
     wanted = max(WARM + 1, job.steps // len(job.parts))
     times: list[tuple[bool, float]] = []
     begun = time.perf_counter()
-    while len(times) < wanted and state.index < trainer.stage.steps:
+    spent = 0.0
+    while (len(times) < wanted or spent < PART_S) and state.index < trainer.stage.steps:
         times.append(_timed(trainer, state))
-        if time.perf_counter() - begun > job.seconds / len(job.parts) and len(times) > WARM:
+        spent = time.perf_counter() - begun
+        if spent > job.seconds / len(job.parts) and len(times) > WARM:
             break
     counted = times[WARM:] or times
     seconds = 0.0

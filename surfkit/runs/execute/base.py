@@ -77,6 +77,11 @@ class Executor(Component):
     def at_once(self) -> int | None:
         """How many jobs run on this machine at a time; None if they run on other machines."""
 
+    @property
+    def threads_each(self) -> int:
+        """Threads of each job on this machine; 0 for as many as torch uses in this process."""
+        return 0
+
     @abstractmethod
     def ready(self) -> None:
         """Check that it can run jobs, before the run begins.
@@ -149,6 +154,11 @@ class Pool(Executor):
         """See `Executor.at_once`."""
         return self.workers
 
+    @property
+    def threads_each(self) -> int:
+        """See `Executor.threads_each`."""
+        return self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers)
+
     def ready(self) -> None:
         """See `Executor.ready`."""
         if not self.gpus:
@@ -161,7 +171,7 @@ class Pool(Executor):
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         waiting = sort_by_cost(jobs)
-        workers = Workers(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers), self.gpus)
+        workers = Workers(self.threads_each, self.gpus)
         room = self.memory_share * free_bytes()
         with terminable():
             try:

@@ -106,6 +106,19 @@ def test_all_that_is_missing_is_told_at_once(monkeypatch, tmp_path, capsys, prot
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
+def test_data_one_level_too_deep_are_found_and_named(monkeypatch, tmp_path, capsys):
+    """As archives unpack: data/training/Barn instead of data/Barn."""
+    monkeypatch.chdir(tmp_path)
+    os.makedirs("data/training/Barn/images")
+    open("file", "w").close()
+    assert main(["benchmark", "tanks-and-temples", "--root", "data", "--scenes", "barn", "--check"]) == 2
+    said = capsys.readouterr().err
+    assert "data/Barn/images: missing, but data/training/Barn/images is there: move it" in said
+    assert "data/Barn/Barn.ply: missing; it is" in said
+    assert main(["benchmark", "tanks-and-temples", "--root", "file", "--check"]) == 2
+    assert "file: a file, not a folder; name with --root" in capsys.readouterr().err
+
+
 def test_what_is_not_as_it_should_be(root, tiny, tmp_path, capsys, monkeypatch):
     folder = copy(root, tmp_path / "data")
     (folder / "A/images/view_001.png").unlink()
