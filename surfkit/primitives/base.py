@@ -154,6 +154,19 @@ class Primitive(Component):
         """See `Rasterizer.contribution`; for a primitive with a `render` of its own that is to be trimmed or cut."""
         return rasterizer.contribution(splats, camera, near, alpha_power, transmittance_power)
 
+    def leading(self, splats: Splats, camera: Camera, rasterizer: Rasterizer, near: float) -> Tensor:
+        """See `Rasterizer.leading`; for a primitive with a `render` of its own, for densifiers that ask for it.
+
+        Raises:
+            BadInput: By default, of a primitive with a `contribution` of its own: what it draws are not the points.
+        """
+        if type(self).contribution is not Primitive.contribution:
+            raise BadInput(
+                f"primitive {kebab(type(self).__name__)} draws itself and does not tell which points lead in a pixel, "
+                "which the densifier asks for; choose another densifier, or give the primitive a `leading`"
+            )
+        return rasterizer.leading(splats, camera, near)
+
     def opacity_before(
         self, splats: Splats, camera: Camera, rasterizer: Rasterizer, near: float, points: Tensor
     ) -> Tensor:
