@@ -102,8 +102,8 @@ from surfkit.primitives.storage import Storage
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
-from surfkit.raster.boxes import SplatBoxes
 from surfkit.raster.normals import normals_of
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.ssim import ssim_map
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction

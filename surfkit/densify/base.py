@@ -195,6 +195,11 @@ class Densify(Policy):
         return False
 
     @property
+    def needs_leading(self) -> bool:
+        """Whether it asks for `Views.leading`; primitives without `tells_leading` are refused."""
+        return False
+
+    @property
     def most_points(self) -> int | None:
         """The number of points beyond which none is added; None where there is no such number."""
         return None

@@ -27,7 +27,7 @@ from surfkit.core.registry import Component, kebab
 from surfkit.scene.camera import Camera
 
 if TYPE_CHECKING:
-    from surfkit.raster.boxes import SplatBoxes
+    from surfkit.raster.splat_boxes import SplatBoxes
 
 ALPHA_MAX = float(np.float32(0.99))
 ALPHA_MIN = float(np.float32(1 / 255))

@@ -9,8 +9,8 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.boxes import SplatBoxes
 from surfkit.raster.reference import Reference
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import splats

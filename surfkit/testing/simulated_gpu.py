@@ -20,9 +20,9 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.boxes import SplatBoxes
 from surfkit.raster.nvrtc import modules
 from surfkit.raster.nvrtc.emulated import Emulated
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)

@@ -56,6 +56,11 @@ class SparsityCompensation(ADC):
             if getattr(self, name) < 1:
                 raise BadInput(f"densify.{name} is {getattr(self, name)}; it must be 1 or more")
 
+    @property
+    def needs_leading(self) -> bool:
+        """See `Densify.needs_leading`."""
+        return True
+
     def edit(self, points: Points, step: Step) -> Edit | None:
         """As ADC; where points are added, those of eq. 5 are split too."""
         if not self.is_due(step.index):

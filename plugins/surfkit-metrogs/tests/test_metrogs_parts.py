@@ -10,7 +10,7 @@ from surfkit_metrogs.densify import SparsityCompensation, density
 from surfkit_metrogs.losses import LargeScale
 
 from surfkit.core.registry import plugins
-from surfkit.densify import Elongation
+from surfkit.densify import Elongation, PointCap
 from surfkit.plugin import (
     ADC,
     BadInput,
@@ -26,6 +26,7 @@ from surfkit.plugin import (
     Surfel2D,
     View,
     components,
+    refuse_unfit_stage,
 )
 from surfkit.raster.select import select
 from surfkit.study.ablation import build, offered_tables
@@ -194,6 +195,15 @@ def test_views_are_drawn_anew_at_each_edit():
     assert torch.equal(step.views.leading([0, 1]) + step.views.leading(range(2, 10)), step.views.leading())
     splits = [bool(few.edit(points, replace(step, seed=seed)).split.any()) for seed in range(20)]
     assert splits == [bool({0, 1} & set(one)) for one in drawn], "only two views show the sparse wall"
+
+
+@pytest.mark.parametrize("densify", [SparsityCompensation(), PointCap(SparsityCompensation(), 500)])
+def test_primitives_that_do_not_tell_are_refused_before_the_run(densify, monkeypatch):
+    refuse_unfit_stage("pretrain", Stage(densify=densify), Surfel2D())
+    monkeypatch.setattr(Surfel2D, "contribution", lambda self, *given: None)  # of something else than its points
+    with pytest.raises(BadInput, match=r"pretrain.densify: .* asks which points lead in a pixel, .* does not tell"):
+        refuse_unfit_stage("pretrain", Stage(densify=densify), Surfel2D())
+    refuse_unfit_stage("pretrain", Stage(), Surfel2D())
 
 
 @pytest.mark.parametrize("part", [SparsityCompensation(), SparsityCompensation(area=0, crowd=1_000), LargeScale()])

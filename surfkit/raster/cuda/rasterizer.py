@@ -19,10 +19,10 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
 from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.boxes import SplatBoxes
 from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
