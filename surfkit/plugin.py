@@ -101,9 +101,10 @@ from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
 from surfkit.primitives.storage import Storage
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.normals import normals_of
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.ssim import ssim_map
 from surfkit.runs.execute.base import Executor, Job, JobResult
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction

@@ -66,6 +66,7 @@ def drawn(rasterizer, splats):
         contribution = rasterizer.contribution(splats, camera(), 0.1, 0.5, 0.5)
         found = {f"map {name}": value for name, value in render.maps.present().items()}
         found |= {"seen": render.seen, "radii": render.radii, "count": contribution[1]}
+        found["leads"] = rasterizer.leading(splats, camera(), 0.1)
         found |= {f"by {name}": getattr(gradients, name) for name in COLUMNS} | {"by sum": contribution[0]}
     return found
 

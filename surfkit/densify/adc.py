@@ -155,10 +155,14 @@ class ADC(Densify):
 
     def _hot(self, points: Points, step: Step) -> Tensor:
         """(N,) bool, points to be densified."""
+        return admitted(self.filters, step, self.want(points, step))
+
+    def want(self, points: Points, step: Step) -> Tensor:
+        """(N,) how strongly each point wants to be densified, at least `least_want`; 0 for those that do not."""
         seen = points.stat(SEEN_STAT).clamp_min(1)
         mean, least = points.stat(GRAD_STAT) / seen, self.threshold
         if self.split_threshold is not None:  # in multiples of the threshold, so that both kinds can be compared
             small = step.splats.scales.amax(-1) <= self.small
             mean = torch.where(small, points.stat(SIGNED_STAT) / seen / self.threshold, mean / self.split_threshold)
             least = 1.0
-        return admitted(self.filters, step, mean * (mean >= least))
+        return mean * (mean >= least)

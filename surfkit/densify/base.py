@@ -44,6 +44,10 @@ class Views(Protocol):
     def contributions(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Contribution:
         """The tally of alpha^a T^b."""
 
+    def leading(self, at: Sequence[int] | None = None) -> Tensor:
+        """(N,) int64, pixels of all views, or of those at the places `at`, in which each point both has the largest
+        weight and is that of the median depth (`Rasterizer.leading`); computed each time that it is asked for."""
+
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Sum of alpha^a T^b, (N,), and count of pixels, (N,) int64, of one view after the other."""
 
@@ -188,6 +192,11 @@ class Densify(Policy):
     @property
     def needs_pixels(self) -> bool:
         """Whether it reads `Step.view`; primitives that draw themselves, which cannot give it, are refused."""
+        return False
+
+    @property
+    def needs_leading(self) -> bool:
+        """Whether it asks for `Views.leading`; primitives without `tells_leading` are refused."""
         return False
 
     @property

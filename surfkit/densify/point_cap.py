@@ -76,6 +76,11 @@ class PointCap(Densify):
         return self.inner.needs_pixels
 
     @property
+    def needs_leading(self) -> bool:
+        """See `Densify.needs_leading`."""
+        return self.inner.needs_leading
+
+    @property
     def most_points(self) -> int:
         """See `Densify.most_points`."""
         inner = self.inner.most_points

@@ -154,6 +154,25 @@ class Primitive(Component):
         """See `Rasterizer.contribution`; for a primitive with a `render` of its own that is to be trimmed or cut."""
         return rasterizer.contribution(splats, camera, near, alpha_power, transmittance_power)
 
+    @property
+    def tells_leading(self) -> bool:
+        """Whether `leading` is known: by default not for a `contribution` of its own, of others than the points."""
+        own = type(self)
+        return own.leading is not Primitive.leading or own.contribution is Primitive.contribution
+
+    def leading(self, splats: Splats, camera: Camera, rasterizer: Rasterizer, near: float) -> Tensor:
+        """See `Rasterizer.leading`; for a primitive with a `render` of its own, for densifiers that ask for it.
+
+        Raises:
+            BadInput: By default, where it is not known (`tells_leading`).
+        """
+        if not self.tells_leading:
+            raise BadInput(
+                f"primitive {kebab(type(self).__name__)} draws itself and does not tell which points lead in a pixel, "
+                "which the densifier asks for; choose another densifier, or give the primitive a `leading`"
+            )
+        return rasterizer.leading(splats, camera, near)
+
     def opacity_before(
         self, splats: Splats, camera: Camera, rasterizer: Rasterizer, near: float, points: Tensor
     ) -> Tensor:

@@ -42,6 +42,10 @@ class PrimitiveRasterizer(Rasterizer):
         """See `Rasterizer.contribution`."""
         return self.primitive.contribution(splats, camera, self.inner, near, alpha_power, transmittance_power)
 
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.leading`."""
+        return self.primitive.leading(splats, camera, self.inner, near)
+
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         """See `Rasterizer.opacity_before`."""
         return self.primitive.opacity_before(splats, camera, self.inner, near, points)
@@ -90,5 +94,5 @@ def drawn_by(primitive: Primitive, rasterizer: Rasterizer) -> Rasterizer:
 
 def draws_itself(primitive: Primitive) -> bool:
     """Whether a primitive draws its splats in its own way."""
-    own, ways = type(primitive), ("render", "contribution", "opacity_before")
+    own, ways = type(primitive), ("render", "contribution", "leading", "opacity_before")
     return any(getattr(own, name) is not getattr(Primitive, name) for name in ways)

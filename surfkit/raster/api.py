@@ -14,16 +14,20 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.registry import Component
+from surfkit.core.check import BadInput
+from surfkit.core.registry import Component, kebab
 from surfkit.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from surfkit.raster.splat_boxes import SplatBoxes
 
 ALPHA_MAX = float(np.float32(0.99))
 ALPHA_MIN = float(np.float32(1 / 255))
@@ -280,56 +284,6 @@ class Render(ABC):
         """
 
 
-@dataclass
-class SplatBoxes:
-    """Boxes around the splats of B blocks: all that is needed to tell that a view shows none of them.
-
-    Attributes:
-        kind, geometry, dilation: As of `Splats`.
-        low: (B, 3) float32, lowest coordinates of the means.
-        high: (B, 3) float32, highest.
-        scale: (B,) float32, largest scale.
-    """
-
-    kind: str
-    geometry: str
-    dilation: float
-    low: Tensor
-    high: Tensor
-    scale: Tensor
-
-    @classmethod
-    def of(cls, splats: Splats, size: int) -> SplatBoxes:
-        """The boxes around each `size` of N splats, in their order; the last block may have fewer."""
-        pad = -len(splats) % size
-        means, scales = splats.means.detach().float(), splats.scales.detach().float().amax(1)
-        if pad:
-            means, scales = torch.cat([means, means[-1:].expand(pad, 3)]), torch.cat([scales, scales[-1:].expand(pad)])
-        blocks = means.view(-1, size, 3)
-        form = splats.kind, splats.geometry, splats.dilation
-        return cls(*form, blocks.amin(1), blocks.amax(1), scales.view(-1, size).amax(1))
-
-    @classmethod
-    def joined(cls, parts: Sequence[SplatBoxes]) -> SplatBoxes:
-        """Those of several, one after the other."""
-        low, high, scale = (torch.cat([getattr(part, name) for part in parts]) for name in ("low", "high", "scale"))
-        return replace(parts[0], low=low, high=high, scale=scale)
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-    def take(self, rows: Tensor) -> SplatBoxes:
-        """Those of (K,) indices."""
-        return replace(self, low=self.low[rows], high=self.high[rows], scale=self.scale[rows])
-
-    def widen(self, blocks: Tensor, splats: Splats) -> None:
-        """Take in R splats, each into the box of its block, (R,) int64."""
-        means, into = splats.means.detach().float(), blocks[:, None].expand(-1, 3)
-        self.low.scatter_reduce_(0, into, means, "amin")
-        self.high.scatter_reduce_(0, into, means, "amax")
-        self.scale.scatter_reduce_(0, blocks, splats.scales.detach().float().amax(1), "amax")
-
-
 @dataclass(frozen=True)
 class Rasterizer(Component):
     """Draws splats on one kind of device. The device chooses among those that are registered; a recipe does not."""
@@ -388,6 +342,20 @@ class Rasterizer(Component):
 
         CityGaussianV2, eq. single-view contribution.
         """
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """(N,) int64, the pixels in which a splat both has the largest weight alpha T, the first in depth order of
+        equal ones, and is that of the median depth, as `Maps` defines it.
+
+        MetroGS, section 4.2.2, eq. 5: S_i of one view.
+
+        Raises:
+            BadInput: By default, as a rasterizer of another package need not know.
+        """
+        raise BadInput(
+            f"rasterizer {kebab(type(self).__name__)} does not tell which splats lead in a pixel, which a densifier "
+            "asks for; choose another densifier, or give the rasterizer a `leading`"
+        )
 
     @abstractmethod
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import CUTOFF, SplatBoxes, Splats
+from surfkit.raster.api import CUTOFF, Splats
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 
 SPLAT_MARGIN_PX = 3.0

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.culling import boxes_may_touch
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -56,6 +57,13 @@ class NativeRasterizer(Rasterizer):
         count = torch.zeros(len(splats), dtype=torch.int64)
         drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())
         return total, count
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.leading`."""
+        drawn = Pass(splats.with_colors(torch.zeros(len(splats), 1, 3)), camera, near)
+        count = torch.zeros(len(splats), dtype=torch.int64)
+        drawn.native.leading(count, torch.get_num_threads())
+        return count
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = Pass(splats.with_colors(torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)

@@ -116,10 +116,8 @@ def _blend(
     alpha, before, depth, risky, touched = _alphas(prints, rows, x, y, shift)
     weight = alpha * before
     total = weight.sum(0)
-    met = (alpha > 0) & (before > 0.5)
-    last = (met * torch.arange(1, len(rows) + 1)[:, None]).amax(0)
-    opaque = (last > 0) & (total >= 0.5)
-    median = torch.where(opaque, depth.gather(0, (last - 1).clamp_min(0)[None])[0], 0.0)
+    middle, opaque = _median(alpha, before, total)
+    median = torch.where(opaque, depth.gather(0, middle[None])[0], 0.0)
     inverse = 1 / depth
     shift = inverse.detach().mean(0)  # a pair's difference does not change with it, its rounding does
     inverse = inverse - shift
@@ -132,6 +130,14 @@ def _blend(
         normal = torch.einsum("npi,np->ip", prints.normals(rows, x, y), weight)
     block = torch.cat([*parts, normal, bend[None]])
     return block, risky, touched
+
+
+def _median(alpha: Tensor, before: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """(P,) which of n splats is that of the median depth, and (P,) bool where there is one; of (n, P) alpha and
+    transmittance and (P,) the sum of the weights."""
+    met = (alpha > 0) & (before > 0.5)
+    last = (met * torch.arange(1, len(alpha) + 1)[:, None]).amax(0)
+    return (last - 1).clamp_min(0), (last > 0) & (total >= 0.5)
 
 
 @dataclass(frozen=True)
@@ -165,6 +171,23 @@ class Reference(Rasterizer):
                 total[rows] += term.sum(1)
                 count[rows] += (alpha > 0).sum(1)
         return total, count
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.leading`."""
+        validate(splats)
+        count = torch.zeros(len(splats), dtype=torch.int64)
+        with torch.no_grad():
+            prints = footprints(splats, camera, near)
+            for tile in _tiles(camera):
+                rows, x, y = _in_tile(prints, tile, True), *_pixels(tile, splats.means.dtype)
+                if not len(rows):
+                    continue
+                alpha, before, *_ = _alphas(prints, rows, x, y)
+                weight = alpha * before
+                middle, opaque = _median(alpha, before, weight.sum(0))
+                leads = opaque & (weight.argmax(0) == middle)  # of equal weights the first
+                count += torch.bincount(rows[middle[leads]], minlength=len(splats))
+        return count
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         validate(splats)

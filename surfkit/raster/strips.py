@@ -73,6 +73,14 @@ def contribution(
     return total, count
 
 
+def leading(colored: Splats, camera: Camera, near: float, strip: Strip) -> Tensor:
+    """`Rasterizer.leading` over the pixels of a strip, (N,) int64."""
+    count = torch.zeros(len(colored), dtype=torch.int64)
+    grey = colored.with_colors(torch.zeros(len(colored), 3))
+    Pass(grey, camera, near, strip=strip).native.leading(count, torch.get_num_threads())
+    return count
+
+
 def _shading(splats: Splats) -> list[Tensor]:
     """What colours depend on: positions (N, 3) and harmonics (N, 1, 3) and (N, K - 1, 3)."""
     return [value.detach().contiguous() for value in (splats.means, splats.sh0, splats.sh_rest)]

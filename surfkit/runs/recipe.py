@@ -256,6 +256,11 @@ def refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
             f"{path}.densify: {name_of(stage.densify)} needs the weights that points are blended with, and primitive "
             f"{name_of(primitive)} draws itself without them; choose {path}.densify:adc, or another primitive"
         )
+    if stage.densify is not None and stage.densify.needs_leading and not primitive.tells_leading:
+        raise BadInput(
+            f"{path}.densify: {name_of(stage.densify)} asks which points lead in a pixel, and primitive "
+            f"{name_of(primitive)} does not tell; choose {path}.densify:adc, or another primitive"
+        )
     if stage.appearance is not None:
         stage.appearance.refuse_unfit(primitive)
         used = {name for index in (1, (stage.steps + 1) // 2, stage.steps) for name in stage.weights_at(index)}

@@ -73,6 +73,10 @@ class KnownViews:
         seen = (self.contribution > 0).long()
         return Contribution(self.contribution**alpha_power, self.contribution**alpha_power, 50 * seen, 10 * seen)
 
+    def leading(self, at: Sequence[int] | None = None) -> Tensor:
+        """See `Views.leading`; up to 2 pixels of each view."""
+        return (2 * self.contribution).round().long() * (len(self) if at is None else len(at))
+
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
         """See `Views.each`."""
         for at in range(len(self)):

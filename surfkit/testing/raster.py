@@ -8,8 +8,9 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.reference import Reference
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 from surfkit.testing.equality import assert_same, unchanged
 from surfkit.testing.inputs import splats
@@ -119,11 +120,21 @@ def _check_measures(name: str, rasterizer: Rasterizer, reference: Rasterizer, gi
     pairs = [each.contribution(given, camera, NEAR_PLANE, 0.5, 0.5) for each in (rasterizer, reference)]
     for what, got, wanted in zip(("sum", "count"), *pairs, strict=True):
         _check_close(f"{name}: the {what} of contribution", got, wanted, off=0.01)
+    got, wanted = _leading(rasterizer, given), reference.leading(given, camera, NEAR_PLANE)
+    if got is not None:
+        _check_close(f"{name}: leading", got, wanted, off=0.01)
     missed = int(((pairs[1][1] > 0) & ~rasterizer.render(given, camera, NEAR_PLANE).seen).sum())
     assert not missed, f"{name}: {missed} splats are blended into pixels, but not `seen`"
     places = torch.rand(200, 3, generator=torch.Generator().manual_seed(1))
     got, wanted = (each.opacity_before(given, camera, NEAR_PLANE, places) for each in (rasterizer, reference))
     _check_close(f"{name}: opacity_before", got, wanted)
+
+
+def _leading(rasterizer: Rasterizer, given: Splats) -> torch.Tensor | None:
+    """`Rasterizer.leading` of one that has it."""
+    if type(rasterizer).leading is Rasterizer.leading:
+        return None
+    return rasterizer.leading(given, _camera(), NEAR_PLANE)
 
 
 def _check_refusal(name: str, rasterizer: Rasterizer, given: Splats) -> None:

@@ -19,9 +19,10 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.nvrtc import modules
 from surfkit.raster.nvrtc.emulated import Emulated
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)
@@ -264,6 +265,9 @@ class OnSimulatedGpu(Rasterizer):
     ) -> tuple[Tensor, Tensor]:
         total, count = self.inner.contribution(_here(splats), camera, near, alpha_power, transmittance_power)
         return total.to(splats.means.device), count.to(splats.means.device)
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        return self.inner.leading(_here(splats), camera, near).to(splats.means.device)
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         return self.inner.opacity_before(_here(splats), camera, near, points.cpu()).to(points.device)

@@ -107,6 +107,10 @@ class EveryView:
         values = (found.mean, found.peak, found.hits, found.views)
         return Contribution(*(self.processes.gathered(value, self.counts) for value in values))
 
+    def leading(self, at: Sequence[int] | None = None) -> Tensor:
+        """See `Views.leading`."""
+        return self.processes.gathered(self.own.leading(at), self.counts)
+
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
         """See `Views.each`."""
         for amount, count in self.own.each(alpha_power, transmittance_power):

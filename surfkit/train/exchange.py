@@ -24,7 +24,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.raster.api import STANDARD, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.native_rasterizer import NativeRasterizer, NativeRender, maps_made, may_touch
-from surfkit.raster.strips import Strip, colors, colors_backward, contribution, pixel_rows, tile_rows
+from surfkit.raster.strips import Strip, colors, colors_backward, contribution, leading, pixel_rows, tile_rows
 from surfkit.scene.camera import Camera
 from surfkit.train.processes import Processes
 
@@ -64,6 +64,11 @@ class DividedRasterizer(Rasterizer):
         found = contribution(sent.received(), camera, near, powers, sent.strips[self.processes.rank])
         total = sent.returned(torch.stack([value.double() for value in found], 1))
         return total[:, 0].float(), total[:, 1].long()
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.leading`; N is of this process."""
+        sent = Exchange(self.processes, splats, camera, near, self.strips(camera))
+        return sent.returned(leading(sent.received(), camera, near, sent.strips[self.processes.rank]))
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         """BadInput: no process has all splats that may be before (P, 3) points."""

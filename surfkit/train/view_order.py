@@ -94,6 +94,20 @@ class ViewContributions:
             self.tallies[powers] = replace(found, mean=found.mean / len(self.views))
         return self.tallies[powers]
 
+    def leading(self, at: Sequence[int] | None = None) -> Tensor:
+        """See `Views.leading`."""
+        found: Tensor | None = None
+        for view in self.views if at is None else [self.views[i] for i in at]:
+            rows, splats = (None, self.shape) if self.of_view is None else self.of_view(view.camera)
+            here = self.rasterizer.leading(splats, view.camera, self.near)
+            if rows is None:
+                here = here[: self.rows]
+            else:
+                here = here.new_zeros(self._told(here)).index_copy_(0, rows.to(here.device), here[: len(rows)])
+            found = here if found is None else found + here
+        assert found is not None, "there are views"
+        return found
+
     def _nothing(self, amount: Tensor) -> Contribution:
         """What no view tells, where the amounts of one lie."""
         told = self._told(amount)

@@ -4,9 +4,10 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit.raster.api import SplatBoxes, Splats
+from surfkit.raster.api import Splats
 from surfkit.raster.culling import boxes_may_touch, may_touch
 from surfkit.raster.native_rasterizer import NativeRasterizer
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 
 NEAR = 0.01

@@ -209,12 +209,13 @@ def everything(shown: Splats, view: Camera) -> dict[str, Tensor]:
     total = Maps(**{key: draws.normal(*value.shape).float() for key, value in render.maps.present().items()})
     gradients = render.backward(total, Maps(color=total.color))
     summed, count = NativeRasterizer().contribution(shown, view, NEAR, 0.5, 0.5)
+    leads = NativeRasterizer().leading(shown, view, NEAR)
     image = render.maps.color.clamp(0, 1).requires_grad_()
     similar = ssim(image, image.detach().flip(2))
     similar.backward()
     made = {**render.maps.present(), **{f"d {key}": value for key, value in gradients.tensors().items()}}
     made |= {"signal": gradients.signal, "chosen": gradients.chosen, "seen": render.seen, "radii": render.radii}
-    return made | {"sum": summed, "count": count, "ssim": similar.detach(), "d ssim": image.grad}
+    return made | {"sum": summed, "count": count, "leads": leads, "ssim": similar.detach(), "d ssim": image.grad}
 
 
 @pytest.fixture

@@ -71,6 +71,11 @@ class Counts(Own):
         return total / count.clamp_min(1), count
 
 
+class Loud(Own):
+    def leading(self, splats, camera, near):
+        return Reference().leading(splats, camera, near) + 9
+
+
 class Blind(Own):
     def spoilt(self, render):
         nobody = torch.zeros_like(render.seen)
@@ -96,6 +101,7 @@ class Closed(Own):
         (Noisy(), "Noisy.render is not repeatable: color"),
         (Lenient(), "Lenient draws .*NaN"),
         (Counts(), r"Counts of surfels: .*contribution: \d+%"),
+        (Loud(), r"Loud of surfels: leading: \d+%"),
         (Narrow(), r"Narrow of surfels: \d+ .*`in_view`"),
         (Closed(), r"Closed of surfels: 4 .*`boxes_in_view`"),
         (Blind(), r"Blind of surfels: \d+ .*`seen`"),

@@ -102,6 +102,7 @@ class Tallies(Prune):
         tally = step.views.contributions(0.5, 0.5)
         self.found.append([tally.mean, tally.peak, tally.hits, tally.views])
         self.found[-1] += [value for each in step.views.each(1.0, 1.0) for value in each]
+        self.found[-1] += [step.views.leading(), step.views.leading([0])]
 
 
 def test_contributions_of_points_in_view_are_those_of_all(apart):

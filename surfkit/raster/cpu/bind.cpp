@@ -134,6 +134,11 @@ void add_raster(nb::module_& m) {
                  nb::gil_scoped_release free;
                  self.contribution((float)alpha_power, (float)open_power, sum.data(), count.data(), threads);
              })
+        .def("leading",
+             [](Pass& self, Counts count, int threads) {
+                 nb::gil_scoped_release free;
+                 self.leading(count.data(), threads);
+             })
         .def("probe", [](Pass& self, Points points, Array opacity, int threads) {
             nb::gil_scoped_release free;
             self.probe(points.data(), (int64_t)points.shape(0), opacity.data(), threads);

@@ -309,6 +309,54 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
     }
 }
 
+// ---- the leading splat of each pixel
+
+// Adds one to the slot of the splat that has the largest weight of a pixel, where it is that of the median depth too.
+// Of equal weights the first counts.
+template <class K>
+void leading_tile(const Tile& tile, uint32_t* counts) {
+    Floats open[kBlocks], most[kBlocks] = {};
+    Ints top[kBlocks], middle[kBlocks];
+    Mask alive[kBlocks];
+    uint64_t rays = tile.inside();  // blocks with a ray that has not ended
+    const Lanes& grid = lanes();
+    for (int b = 0; b < kBlocks; b++) {
+        open[b] = broadcast(1.0f);
+        top[b] = middle[b] = Ints{} - 1;
+        alive[b] = tile.inside(b);
+    }
+    for (int64_t k = tile.begin; k < tile.end && rays; k++) {
+        fetch<K, 8>(tile, k);
+        const auto& s = record_of<K>(tile, k);
+        const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
+        const typename K::Local local = K::Local::of(s, sx, sy);
+        const Ints here = Ints{} + (int32_t)(k - tile.begin);
+        for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
+            const int bit = __builtin_ctzll(todo), b = block_at(bit);
+            typename K::Pixel at;
+            at.shape(local, grid.x[b], grid.y[b]);
+            const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+            Mask m = less_equal(kAlphaMin, alpha) & alive[b];
+            if (!any(m)) continue;
+            const Floats before = open[b], after = before * (1.0f - alpha), w = alpha * before;
+            const Mask ends = m & lesser(after, kTransmittanceMin);
+            alive[b] = without(alive[b], ends);
+            if (!any(alive[b])) rays &= ~(1ull << bit);
+            m = without(m, ends);
+            const Mask larger = m & lesser(most[b], w);
+            most[b] = select(larger, w, most[b]);
+            top[b] = select(larger, here, top[b]);
+            middle[b] = select(m & lesser(0.5f, before), here, middle[b]);
+            open[b] = select(m, after, before);
+        }
+    }
+    for (int b = 0; b < kBlocks; b++) {  // the median exists where half of the light is stopped, as in `Ray::finish`
+        const uint32_t both = bits(less_equal(open[b], broadcast(0.5f)) & equal(top[b], middle[b]));
+        for (int l = 0; l < kLanes; l++)
+            if (both >> l & 1) counts[tile.job.entries[tile.begin + top[b][l]].slot]++;
+    }
+}
+
 // ---- opacity in front of points
 
 template <class K>
@@ -437,6 +485,10 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
             [&](auto k) { contribution_tile<decltype(k)>(Tile(job, tile), alpha_power, open_power, sums, touched); });
 }
 
+void leading(Kind kind, const Job& job, int64_t tile, uint32_t* counts) {
+    of_kind(kind, [&](auto k) { leading_tile<decltype(k)>(Tile(job, tile), counts); });
+}
+
 int tiles(const splat::Bound<double>& bound, int tiles_x, int tiles_y, double rim, uint32_t* to) {
     int count = 0;
     each_tile(bound, splat::outline(bound), 0.0, 0.0, tiles_x, tiles_y, rim, [&](int tile) { to[count++] = (uint32_t)tile; });
@@ -469,6 +521,7 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                forward,
                                backward,
                                contribution,
+                               leading,
                                probe,
                                ray_probe,
                                ssim_rows,

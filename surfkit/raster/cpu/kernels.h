@@ -79,6 +79,8 @@ struct Kernels {
     // Sum and count per slot of alpha^a T^b.
     void (*contribution)(Kind, const Job&, int64_t tile, float alpha_power, float open_power, float* sums,
                          uint8_t* touched);
+    // Adds to each slot the pixels in which its splat has the largest weight and the median depth.
+    void (*leading)(Kind, const Job&, int64_t tile, uint32_t* counts);
     // What is left open of the rays to points in a tile.
     void (*probe)(Kind, const Job&, int64_t tile, const Probes&);
     // The same of `count` ellipsoids that are evaluated in space; (ox, oy): the tile's centre.

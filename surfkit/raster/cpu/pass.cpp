@@ -387,6 +387,19 @@ void Pass::contribution(float alpha_power, float open_power, float* sum, int64_t
     });
 }
 
+void Pass::leading(int64_t* count, int threads) {
+    std::vector<uint32_t> counts(pairs(), 0);
+    const Job work = job();
+    const Kernels& k = kernels();
+    parallel((int64_t)tiles_x_ * tiles_y_, threads,
+             [&](int64_t tile) { k.leading(kind_, work, tile, counts.data()); });
+    each_seen(threads, [&](int64_t r) {
+        int64_t pixels = 0;
+        for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) pixels += counts[slot];
+        count[index_[r]] = pixels;
+    });
+}
+
 void Pass::probe(const double* points, int64_t count, float* opacity, int threads) {
     const int tiles = tiles_x_ * tiles_y_;
     std::vector<std::vector<int64_t>> inside(tiles);

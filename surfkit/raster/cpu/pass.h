@@ -35,6 +35,8 @@ class Pass {
     void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute, int64_t rows,
                   const GradientArrays& out, int threads);
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
+    // Pixels in which each splat has both the largest weight and the median depth; written for those that are seen.
+    void leading(int64_t* count, int threads);
 
     // 1 - product of 1 - alpha of the splats met on the way to points (x px, y px, z); NaN where they are not in view.
     void probe(const double* points, int64_t count, float* opacity, int threads);

@@ -1,4 +1,4 @@
-// What each splat contributes to a view, and what the splats hide of points.
+// What each splat contributes to a view, where it leads, and what the splats hide of points.
 #include "view.h"
 
 using namespace surfkit;
@@ -95,6 +95,60 @@ total(Buffer<const long long> index, Buffer<const int> first, Buffer<const float
     }
     total_sum[index[r]] = (float)sum;
     total_count[index[r]] = count;
+}
+
+// Adds one to the splat that has the largest weight of a pixel, where it is that of the median depth too. Of equal
+// weights the first counts. Whole numbers come to the same sum in any order, so that atomics change no bit.
+KERNEL(kThreads)
+leading(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries, Buffer<const long long> offsets,
+        Buffer<const long long> index, Buffer<int> count) {
+    SHARED(Staged, staged, kBatch);
+    SHARED(Reach, reaches, kBatch);
+    const Pixel pixel(view);
+    const int lane = threadIdx.x % 32;
+    float open = 1.0f, most = 0.0f;
+    long long top = -1, middle = -1;
+    bool is_alive = pixel.is_inside;
+    const long long begin = offsets[pixel.tile], end = offsets[pixel.tile + 1];
+    for (long long at = begin; at < end; at += kBatch) {
+        if (!__syncthreads_or(is_alive)) break;
+        const int size = (int)min((long long)kBatch, end - at);
+        if (threadIdx.x < size) {
+            const Entry entry = entries[at + threadIdx.x];
+            const SplatRecord r = records[entry.record];
+            staged[threadIdx.x] = stage(view, pixel.tile, r);
+            reaches[threadIdx.x] = reach(view, pixel.tile, r);
+        }
+        __syncthreads();
+        bool is_near = false;
+        if (lane < size) {
+            const Reach s = reaches[lane];
+            is_near = touches(s, pixel);
+        }
+        for (unsigned todo = __ballot_sync(kAllLanes, is_near); todo; todo &= todo - 1) {
+            const int j = __ffs(todo) - 1;
+            const Staged s = staged[j];
+            Splat::Pixel here;
+            here.shape(s.local, pixel.dx, pixel.dy);
+            const float alpha = lower(s.local.opacity * exp_negative(-here.half_rho), kAlphaMax);
+            if (alpha < kAlphaMin || !is_alive) continue;
+            const float after = open * (1.0f - alpha), weight = alpha * open;
+            if (after < kTransmittanceMin) {
+                is_alive = false;
+                continue;
+            }
+            if (weight > most) {
+                most = weight;
+                top = at + j;
+            }
+            if (open > 0.5f) middle = at + j;
+            open = after;
+        }
+        // The next barrier is at the head of the loop.
+    }
+    if (middle < 0 || open > 0.5f || top != middle) return;
+    const Entry entry = entries[middle];
+    atomicAdd(&count[index[entry.record]], 1);
 }
 
 // 1 - product of 1 - alpha of the splats met on the way to points (x, y, z), in pixels about the centre of their tile;

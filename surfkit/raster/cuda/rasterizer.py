@@ -18,10 +18,11 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, SplatBoxes, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -294,6 +295,14 @@ class TileRasterizer(Rasterizer):
         program.launch("contribution", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, counts)
         program.launch("total", blocks(len(drawn.index)), 128, drawn.index, drawn.first, sums, counts, total, count)
         return total.to(drawn.home), count.to(drawn.home)
+
+    def leading(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.leading`."""
+        drawn = self._pass(_grey(splats), camera, near)
+        count = drawn.arrays[0].new_zeros(len(splats), dtype=torch.int32)
+        program = drawn.program("contribution", LEVEL=LEVEL_COLOR, CHOSEN=CHOSEN_NOTHING)
+        program.launch("leading", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *drawn.lists, drawn.index, count)
+        return count.long().to(drawn.home)
 
     def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
         """See `Rasterizer.in_view`."""

@@ -50,7 +50,7 @@ SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),
     (raster("gather"), {"gather": (168, 0)}),
-    (raster("contribution"), {"contribution": (80, 7_000), "total": (56, 0), "probe": (56, 0)}),
+    (raster("contribution"), {"contribution": (80, 7_000), "leading": (80, 6_000), "total": (56, 0), "probe": (56, 0)}),
 )
 """Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have; and
 bytes of a thread's own memory, where it keeps lists whose length is not known."""
