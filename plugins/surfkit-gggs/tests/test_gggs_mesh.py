@@ -15,7 +15,7 @@ def radii(mesh):
 
 
 def test_a_ball_of_ellipsoids_becomes_a_ball_a_little_smaller_than_by_the_largest_density():
-    given = mesh_input("gaussian", count=400, views=8)
+    given = mesh_input("gaussian", count=600, views=10)
     mesh, other = SolidField(longest=0).mesh(given), OpacitySurface(longest=0).mesh(given)
     assert np.abs(radii(mesh) - BALL_RADIUS).max() < 0.03 and np.abs(radii(mesh) - BALL_RADIUS).mean() < 0.006
     # A solid hides less at every place but behind it, so its surface lies deeper.
