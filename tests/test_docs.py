@@ -142,9 +142,13 @@ def test_options_are_there(page):
 
 
 def settings_of_package(folder):
-    """Names of what may be settings of the parts of a package in plugins/."""
-    sources = folder.glob("surfkit_*/**/*.py") if folder.name in PLUGINS else ()
-    named = (re.findall(r"^    (\w+):", source.read_text(), re.M) for source in sources)
+    """Names of what may be settings of the parts of a package in plugins/, inherited ones too."""
+    if folder.name not in PLUGINS:
+        return set()
+    package = folder.name.replace("-", "_")
+    named = [re.findall(r"^    (\w+):", source.read_text(), re.M) for source in folder.glob(f"{package}/**/*.py")]
+    own = (cls for _, _, cls in offered("surfkit_components") if cls.__module__.partition(".")[0] == package)
+    named += [list(getattr(cls, "__dataclass_fields__", ())) for cls in own]
     return {name.replace("_", "-") for names in named for name in names}
 
 

@@ -50,7 +50,9 @@ class ViewOpacityField:
         return open_to < (self.agree * looking).clamp_min(1), looking
 
 
-def least_opacity(subject: MeshInput, points: Tensor, what: str, enough: float | None = None) -> tuple[Tensor, Tensor]:
+def least_opacity(
+    subject: MeshInput, points: Tensor, what: str, enough: float | None = None, solid: bool = False
+) -> tuple[Tensor, Tensor]:
     """The opacity field (GOF): how much the splats hide of places from the view that sees them best.
 
     Gaussians hide in part what lies in them (`raster.rays`), unless they draw themselves; splats of other kinds hide as
@@ -62,6 +64,7 @@ def least_opacity(subject: MeshInput, points: Tensor, what: str, enough: float |
         what: The work, for those who wait.
         enough: No further view looks at a place that one has found to be hidden by no more than this, which saves most
             of the work where only the side of a level matters.
+        solid: Whether Gaussians hide as stochastic solids (GGGS) instead of by their largest density.
 
     Returns:
         (P,) float32 in [0, 1], 1 where no view looks, and (P,) int32 how many views look; with `enough`, how many have
@@ -81,7 +84,7 @@ def least_opacity(subject: MeshInput, points: Tensor, what: str, enough: float |
             rows = rows[shown(keep.float(), camera.project(points[rows])) > 0.5]
         if len(rows):
             if in_space:
-                found = ray_opacity(splats, camera, near, points[rows])
+                found = ray_opacity(splats, camera, near, points[rows], solid)
             else:
                 found = subject.rasterizer.opacity_before(splats, camera, near, points[rows])
             looks = ~found.isnan()

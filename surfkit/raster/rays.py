@@ -1,4 +1,8 @@
-"""Ellipsoids evaluated in space, along rays (Yu et al. 2024, GOF), instead of by footprints on the image plane."""
+"""Ellipsoids evaluated in space, along rays, instead of by footprints on the image plane.
+
+They hide by their largest density before a point (Yu et al. 2024, GOF), or as stochastic solids (Zhang et al. 2026,
+GGGS).
+"""
 
 from __future__ import annotations
 
@@ -16,12 +20,18 @@ BATCH_POINT_SPLATS = 1 << 22
 """Pairs of a point and a splat that the reference evaluates at once."""
 
 
-def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-    """What ellipsoids hide of points from a camera: the opacity field of one view (GOF, section 4.2).
+def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor, solid: bool = False) -> Tensor:
+    """What ellipsoids hide of points from a camera: the opacity field of one view.
 
     That is 1 - product of (1 - alpha), where alpha is the opacity times the largest density on the ray between `near`
-    and the point: one that the point lies in hides it in part. Compiled, on `torch.get_num_threads()` threads, with the
-    same bits on any number of them.
+    and the point (GOF, section 4.2): one that the point lies in hides it in part. Compiled, on
+    `torch.get_num_threads()` threads, with the same bits on any number of them.
+
+    As stochastic solids (GGGS, eq. 11 and 12), with the opacity times the density G at the point, and G* at the largest
+    density on the ray, an ellipsoid leaves open sqrt(1 - G) up to there and (1 - G*) / sqrt(1 - G) behind: it goes on
+    hiding while the density falls, and behind it both ways hide the same. G and G* are at most ALPHA_MAX. Where G is
+    below ALPHA_MIN it counts as 0, as in pictures; the tail that is cut would hide 0.2 % at either end. What lies in
+    front of `near` counts as if it were there.
 
     Args:
         splats: N ellipsoids; as where rays are drawn (`Splats.geometry`), those do not count whose centre has z <= near
@@ -29,6 +39,7 @@ def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> 
         camera: World is the splats' frame.
         near: Local units.
         points: (P, 3) world.
+        solid: Whether they hide as stochastic solids.
 
     Returns:
         (P,) in [0, 1]; NaN where the point is outside the image or not beyond `near`.
@@ -40,7 +51,7 @@ def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> 
     if splats.scales.shape[1] != 3:
         raise BadInput(f"rays meet ellipsoids, which have three scales; {splats.kind} splats have two")
     if native.module() is None:
-        return ray_opacity_reference(splats, camera, near, points)
+        return ray_opacity_reference(splats, camera, near, points, solid)
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities)
     opacity = torch.empty(len(points), dtype=torch.float32)
     native.kernels().ray_opacity(
@@ -51,13 +62,14 @@ def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> 
         camera.height,
         near,
         camera.project(points.cpu()).contiguous(),
+        solid,
         opacity,
         torch.get_num_threads(),
     )
     return opacity.to(points.device)
 
 
-def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: Tensor, solid: bool = False) -> Tensor:
     """(P,) as `ray_opacity`, in plain torch, in the precision of the splats, every pair of a point and a splat."""
     to_camera = camera.world_to_camera.to(splats.means)
     centre = splats.means @ to_camera[:3, :3].T + to_camera[:3, 3]
@@ -76,8 +88,17 @@ def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: T
         direction = torch.einsum("nij,pj->pni", units, ray)
         a, b = direction.square().sum(2), 2 * (direction * origin).sum(2)
         c = origin.square().sum(1)
-        t = torch.minimum(-b / (2 * a), z[rows][:, None]).clamp_min(near)
-        alpha = splats.opacities * torch.exp(-(a * t**2 + b * t + c) / 2)
-        alpha = torch.where((alpha >= ALPHA_MIN) & there, alpha.clamp_max(ALPHA_MAX), 0.0)
-        found[rows] = 1 - (1 - alpha).prod(1)
+        here, peak = z[rows][:, None], -b / (2 * a)
+
+        def alpha(t: Tensor, a: Tensor = a, b: Tensor = b, c: Tensor = c) -> Tensor:
+            value = splats.opacities * torch.exp(-(a * t**2 + b * t + c) / 2)
+            return torch.where((value >= ALPHA_MIN) & there, value.clamp_max(ALPHA_MAX), 0.0)
+
+        if solid:
+            t = peak.clamp_min(near)
+            vacancy = (1 - alpha(here)).sqrt()
+            left = torch.where(t < here, (1 - alpha(t)) / vacancy, vacancy)
+        else:
+            left = 1 - alpha(torch.minimum(peak, here).clamp_min(near))
+        found[rows] = 1 - left.prod(1)
     return found

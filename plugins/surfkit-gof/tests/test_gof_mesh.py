@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from surfkit_gof.mesher import OpacityField, in_view
+from surfkit_gof.mesher import OpacityField
 
+from surfkit.mesh.opacity_surface import in_view
 from surfkit.plugin import BadInput
 from surfkit.testing import check, check_mesher
 from surfkit.testing.inputs import BALL_RADIUS, mesh_input

@@ -183,12 +183,12 @@ void add_raster(nb::module_& m) {
         throw nb::value_error(("no kernels named " + name).c_str());
     });
     m.def("ray_opacity", [](std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens, int width,
-                            int height, double near, Points points, Array opacity, int threads) {
+                            int height, double near, Points points, bool solid, Array opacity, int threads) {
         const SplatArrays s{(int64_t)splats.at(0).shape(0), 0,       splats[0].data(), splats.at(1).data(),
                             splats.at(2).data(),            splats.at(3).data()};
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
-        ray_opacity(s, c, points.data(), (int64_t)points.shape(0), opacity.data(), threads);
+        ray_opacity(s, c, points.data(), (int64_t)points.shape(0), solid, opacity.data(), threads);
     });
     m.def(
         "ssim",

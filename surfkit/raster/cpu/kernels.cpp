@@ -383,8 +383,12 @@ void probe_tile(const Tile& tile, const Probes& probes) {
 // The largest density of each ellipsoid between `near` and the points on their rays. With the ray t r from the camera
 // o, it is that at t* = -o.r / r.r or, where t* lies outside, at the nearer end; |o x r|^2 / r.r is the squared
 // distance of the line from the centre, which does not cancel as o.o - (o.r)^2 / r.r would.
-void ray_probe(const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy, float near,
-               const Probes& probes) {
+//
+// As stochastic solids (GGGS, eq. 12) they leave open sqrt(1 - G) up to t*, with the density G at the point, and
+// (1 - G*) / sqrt(1 - G) behind it. G counts from kAlphaMin on, so that behind the contour 1 - G* is left as in pictures.
+template <bool solid>
+void ray_probe_of(const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy, float near,
+                  const Probes& probes) {
     for (int64_t k = 0; k < count; k++) {
         const RaySplat& s = splats[rows[k]];
         double at[3][3], cross[3][3];  // by x, by y, at the centre
@@ -408,14 +412,29 @@ void ray_probe(const RaySplat* splats, const uint32_t* rows, int64_t count, doub
                 aside = madd(m, m, aside);
                 along = madd(r, (float)-s.o[i], along);
             }
-            const Floats peak = along / length, t = higher(lower(peak, z), broadcast(near)), off = t - peak;
-            const Floats half_rho = 0.5f * madd(length * off, off, aside / length);
-            const Floats alpha = lower(s.opacity * exp_negative(-half_rho), broadcast(kAlphaMax));
+            const Floats peak = along / length, line = aside / length;
+            const auto alpha_at = [&](Floats t) {
+                const Floats off = t - peak, rho = madd(length * off, off, line);
+                const Floats half_rho = 0.5f * (solid ? lower(rho, broadcast(100.0f)) : rho);  // points may be far off
+                return lower(s.opacity * exp_negative(-half_rho), broadcast(kAlphaMax));
+            };
+            const Floats first = solid ? peak : lower(peak, z), t = higher(first, broadcast(near));
+            const Floats alpha = alpha_at(t);
             const Mask m = less_equal(kAlphaMin, alpha);
             if (!any(m)) continue;
-            store(probes.open + g, load(probes.open + g) * (1.0f - keep(m, alpha)));
+            Floats open = 1.0f - keep(m, alpha);
+            if (solid) {
+                const Floats here = alpha_at(z), vacancy = root(1.0f - keep(less_equal(kAlphaMin, here) & m, here));
+                open = select(lesser(t, z), open / vacancy, vacancy);
+            }
+            store(probes.open + g, load(probes.open + g) * open);
         }
     }
+}
+
+void ray_probe(bool solid, const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy,
+               float near, const Probes& probes) {
+    (solid ? ray_probe_of<true> : ray_probe_of<false>)(splats, rows, count, ox, oy, near, probes);
 }
 
 // ---- dispatch

@@ -83,9 +83,10 @@ struct Kernels {
     void (*leading)(Kind, const Job&, int64_t tile, uint32_t* counts);
     // What is left open of the rays to points in a tile.
     void (*probe)(Kind, const Job&, int64_t tile, const Probes&);
-    // The same of `count` ellipsoids that are evaluated in space; (ox, oy): the tile's centre.
-    void (*ray_probe)(const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy, float near,
-                      const Probes&);
+    // The same of `count` ellipsoids that are evaluated in space, as stochastic solids or by the largest density;
+    // (ox, oy): the tile's centre.
+    void (*ray_probe)(bool solid, const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy,
+                      float near, const Probes&);
     // Rows [y0, y1) of one plane: SSIM summed, and its three partial-derivative planes.
     double (*ssim_rows)(const float* x, const float* y, int width, int height, int y0, int y1, float* d_mean,
                         float* d_square, float* d_cross);

@@ -75,7 +75,7 @@ std::vector<std::vector<int64_t>> by_tile(const CameraModel<double>& cam, const 
 }  // namespace
 
 void ray_opacity(const SplatArrays& splats, const CameraModel<double>& cam, const double* points, int64_t count,
-                 float* opacity, int threads) {
+                 bool solid, float* opacity, int threads) {
     const int tiles_x = (cam.width + kTile - 1) / kTile, tiles_y = (cam.height + kTile - 1) / kTile,
               tiles = tiles_x * tiles_y;
     const auto inside = by_tile(cam, points, count, tiles_x, tiles, opacity, threads);
@@ -114,8 +114,8 @@ void ray_opacity(const SplatArrays& splats, const CameraModel<double>& cam, cons
             y[j] = (float)(p[1] - oy);
             z[j] = (float)p[2];
         }
-        k.ray_probe(rays.data(), rows.data() + start[tile], start[tile + 1] - start[tile], ox, oy, (float)cam.near,
-                    {(int64_t)size, x.data(), y.data(), z.data(), open.data()});
+        k.ray_probe(solid, rays.data(), rows.data() + start[tile], start[tile + 1] - start[tile], ox, oy,
+                    (float)cam.near, {(int64_t)size, x.data(), y.data(), z.data(), open.data()});
         for (size_t j = 0; j < here.size(); j++) opacity[here[j]] = 1 - open[j];
     });
 }
