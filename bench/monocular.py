@@ -85,7 +85,7 @@ def main() -> None:
             found[row] = {"psnr": metrics["images"]["psnr"]} | {k: scores[k] for k in ("precision", "recall", "f1")}
             print(row, {key: round(value, 4) for key, value in found[row].items()}, flush=True)
     settings = {key: getattr(options, key) for key in ("scale", "steps", "tau", "threshold", "maps")}
-    save("monocular", {"data": options.data.name} | settings | {"rows": found})
+    save(f"monocular_{options.maps}", {"data": options.data.name} | settings | {"rows": found})
 
 
 def call(*words: str) -> None:
