@@ -17,6 +17,7 @@ from surfkit.primitives.edit import Edit, NewPoints, apply, merge
 from surfkit.primitives.points import Points
 from surfkit.scene.scene import SparsePoints
 from surfkit.testing import check_component, check_densify, check_policy
+from surfkit.testing.inputs import KnownViews
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,9 @@ def step_of(points: Points, index: int = 1, **other) -> Step:
     draw = torch.Generator().manual_seed(1)
     color, photo = (torch.rand(3, 12, 16, generator=draw) for _ in range(2))
     view = ComparedView(color, photo, lambda values: torch.full((len(points),), float(values.sum())))
-    return step(index, splats=splats, radii=torch.ones(len(points)), view=view, **(per_point | other))
+    views = KnownViews(torch.ones(len(points)))
+    facts = per_point | {"views": views, "view": view, "radii": torch.ones(len(points))}
+    return step(index, splats=splats, **(facts | other))
 
 
 @pytest.mark.parametrize("inner", [Doubling(), Doubling(drops=7), Doubling(clones=3), Doubling(clones=3, drops=20)])
