@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -18,13 +17,14 @@ from surfkit.scene.align import SCALE_BAND
 
 
 @dataclass(frozen=True)
-class DepthTerm(Loss):
-    """What terms on rendered and estimated inverse depth have in common. Inverse depths are divided by one that is
-    typical of the data set, so that no unit matters."""
+class DepthRegression(Loss):
+    """Difference of inverse depths, rendered and estimated, |D_hat - D| (CityGaussianV2, section 3.2).
+
+    Inverse depths are divided by one that is typical of the data set, so that no unit matters. Either error is a mean
+    over the pixels with a rendered and an estimated depth, weighted by the confidence of the estimate.
+    """
 
     needs_prior: ClassVar[bool] = True
-    title: ClassVar[str] = "depth"
-    """Its name in errors."""
 
     start: float = 0.5
     """Loss weight at the first step; from there to `end` along a straight line in the logarithm, constant
@@ -33,6 +33,9 @@ class DepthTerm(Loss):
     end: float = 0.0025
     """Loss weight at the last step: small for estimates that are coarser than what was learnt by then, as
     large as `start` or larger for those to be trusted to the end."""
+
+    error: Literal["l1", "ssim"] = "l1"
+    """Absolute difference, as in the paper, or one minus the structural similarity, as in the released code."""
 
     depth: Literal["median", "expected"] = "median"
     """Which rendered depth is compared: that of the splat where a ray becomes half opaque, or the mean along the ray,
@@ -44,11 +47,11 @@ class DepthTerm(Loss):
 
     def __post_init__(self) -> None:
         if not (self.start > 0 and self.end > 0):
-            raise BadInput(f"the {self.title} loss has start {self.start:g} and end {self.end:g}; both must be above 0")
+            raise BadInput(f"the depth loss has start {self.start:g} and end {self.end:g}; both must be above 0")
         if not 0 < self.scale_band[0] <= 1 <= self.scale_band[1] < float("inf"):
             raise BadInput(
-                f"the {self.title} loss has scale_band {self.scale_band[0]:g} {self.scale_band[1]:g}; give a multiple "
-                "above 0 and at most 1, and one of at least 1"
+                f"the depth loss has scale_band {self.scale_band[0]:g} {self.scale_band[1]:g}; give a multiple above 0 "
+                "and at most 1, and one of at least 1"
             )
 
     @property
@@ -68,33 +71,6 @@ class DepthTerm(Loss):
         weight = torch.where(there, prior.confidence, 0)
         rendered = torch.where(there, 1 / (torch.where(there, depth, 1) * prior.typical), 0)
         estimated = torch.where(there, prior.inverse / prior.typical, 0)
-        return self.error_of(rendered, estimated, weight, target.seed)
-
-    @abstractmethod
-    def error_of(self, rendered: Tensor, estimated: Tensor, weight: Tensor, seed: int) -> Tensor:
-        """The term, a scalar.
-
-        Args:
-            rendered: (H, W) inverse depth as a multiple of the typical one; 0 where either is unknown.
-            estimated: (H, W) the same of the prior.
-            weight: (H, W) confidence of the estimate; 0 where either is unknown.
-            seed: Of random draws in this step.
-        """
-
-
-@dataclass(frozen=True)
-class DepthRegression(DepthTerm):
-    """Difference of inverse depths, rendered and estimated, |D_hat - D| (CityGaussianV2, section 3.2).
-
-    Either error is a mean over the pixels with a rendered and an estimated depth, weighted by the confidence of the
-    estimate.
-    """
-
-    error: Literal["l1", "ssim"] = "l1"
-    """Absolute difference, as in the paper, or one minus the structural similarity, as in the released code."""
-
-    def error_of(self, rendered: Tensor, estimated: Tensor, weight: Tensor, seed: int) -> Tensor:
-        """See `DepthTerm.error_of`."""
         if self.error == "ssim":
             difference = 1 - ssim_map(rendered[None], estimated[None])[0]
         else:

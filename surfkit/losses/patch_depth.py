@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.losses.depth import DepthTerm
+from surfkit.core.schedule import log_linear
+from surfkit.losses.base import Loss, Target
+from surfkit.raster.api import Maps
+from surfkit.scene.align import SCALE_BAND
 
 KNOWN_SHARE = 0.25
 """A patch of which less is known, as a share of its pixels, says nothing of its shape."""
@@ -18,7 +22,7 @@ front has no relief that could be compared."""
 
 
 @dataclass(frozen=True)
-class PatchDepth(DepthTerm):
+class PatchDepth(Loss):
     """Squared difference of inverse depths, rendered and estimated, each less its mean over a patch of the picture and
     over its spread (DNGaussian, Li et al. CVPR 2024; the depth constraint that GeoSVR, NeurIPS 2025, begins with).
 
@@ -28,7 +32,7 @@ class PatchDepth(DepthTerm):
     (`losses:depth`) cannot follow. The term says nothing of where a surface lies: that is left to the photographs.
     """
 
-    title: ClassVar[str] = "patch-depth"
+    needs_prior: ClassVar[bool] = True
 
     start: float = 0.1
     """Loss weight at the first step; from there to `end` along a straight line in the logarithm."""
@@ -36,26 +40,51 @@ class PatchDepth(DepthTerm):
     end: float = 0.1
     """Loss weight at the last step."""
 
+    patch: int = 16
+    """Side of a patch, pixels; the grid of patches lies elsewhere in each step."""
+
     depth: Literal["median", "expected"] = "expected"
     """Which rendered depth is compared: that of the splat where a ray becomes half opaque, or the mean along the ray,
     from which all its splats learn."""
 
-    patch: int = 16
-    """Side of a patch, pixels; the grid of patches lies elsewhere in each step."""
+    scale_band: tuple[float, float] = SCALE_BAND
+    """Depth priors that are known up to their scale are not used where it is below or above these multiples of the
+    median over all photographs."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if not (self.start > 0 and self.end > 0):
+            raise BadInput(f"the patch-depth loss has start {self.start:g} and end {self.end:g}; both must be above 0")
         if self.patch < 4:
             raise BadInput(f"the patch-depth loss has patches of {self.patch} pixels; give 4 or more")
+        if not 0 < self.scale_band[0] <= 1 <= self.scale_band[1] < float("inf"):
+            raise BadInput(
+                f"the patch-depth loss has scale_band {self.scale_band[0]:g} {self.scale_band[1]:g}; give a multiple "
+                "above 0 and at most 1, and one of at least 1"
+            )
 
-    def error_of(self, rendered: Tensor, estimated: Tensor, weight: Tensor, seed: int) -> Tensor:
-        """See `DepthTerm.error_of`."""
-        side = min(self.patch, *weight.shape)
-        weights = patches(weight, side, seed)
+    @property
+    def reads(self) -> tuple[str, ...]:  # type: ignore[override]  # it depends on a setting
+        """The maps of the depth that is compared."""
+        return ("median",) if self.depth == "median" else ("alpha", "depth")
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return log_linear(self.start, self.end, index / steps)
+
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        depth = maps.need("median") if self.depth == "median" else maps.expected_depth()
+        prior = target.prior
+        if prior is None:
+            return 0 * depth.sum()
+        there = (depth > 0) & (prior.inverse > 0)
+        weight = torch.where(there, prior.confidence, 0)
+        rendered = torch.where(there, 1 / (torch.where(there, depth, 1) * prior.typical), 0)
+        estimated = torch.where(there, prior.inverse / prior.typical, 0)
+        side = min(self.patch, *depth.shape)
+        weights = patches(weight, side, target.seed)
         weights = weights * (weights.sum(1, keepdim=True) >= KNOWN_SHARE * side * side)
         near, far = [], []
         for values in (rendered, estimated):
-            apart = centred(patches(values, side, seed), weights)
+            apart = centred(patches(values, side, target.seed), weights)
             near.append(apart / spread(apart, weights))
             whole = weight.reshape(1, -1)
             far.append(apart / spread(centred(values.reshape(1, -1), whole), whole))
