@@ -16,7 +16,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,10 +24,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component, kebab
+from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
-
-if TYPE_CHECKING:
-    from surfkit.raster.splat_boxes import SplatBoxes
 
 ALPHA_MAX = float(np.float32(0.99))
 ALPHA_MIN = float(np.float32(1 / 255))
