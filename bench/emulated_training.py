@@ -23,7 +23,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.psnr import psnr

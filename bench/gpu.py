@@ -32,7 +32,8 @@ from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes
 from surfkit.mesh.cuda.gpu_grid import GpuGrid
 from surfkit.mesh.lattice import FusionImage, Lattice
 from surfkit.mesh.native_grid import grid
-from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.select import select
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera

@@ -29,7 +29,8 @@ from surfkit.compress.levels.hierarchy import merged_tree
 from surfkit.primitives import Gaussian3D
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.runs.pipeline import loaded
 from surfkit.runs.run_method import splats_of
 from surfkit.scene.camera import Camera

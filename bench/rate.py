@@ -28,7 +28,7 @@ from surfkit.core.registry import find
 from surfkit.io.splats.base import Format
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel, primitive_of
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.psnr import psnr
 from surfkit.runs.context import RunContext
 from surfkit.runs.pipeline import loaded

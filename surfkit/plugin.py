@@ -101,8 +101,9 @@ from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
 from surfkit.primitives.storage import Storage
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Derived, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Derived, Gradients, Maps, Render, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.normals import normals_of
 from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.ssim import ssim_map

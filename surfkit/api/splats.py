@@ -17,7 +17,8 @@ from surfkit.core.registry import find
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.splat_files import format_for, read_splat_file
 from surfkit.io.splats.splat_table import SplatTable
-from surfkit.raster.api import Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 

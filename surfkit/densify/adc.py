@@ -158,7 +158,8 @@ class ADC(Densify):
         return admitted(self.filters, step, self.want(points, step))
 
     def want(self, points: Points, step: Step) -> Tensor:
-        """(N,) how strongly each point wants to be densified, at least `least_want`; 0 for those that do not."""
+        """(N,) how strongly each point wants to be densified, as its mean gradient, in multiples of the thresholds
+        where there are two; 0 for those that do not."""
         seen = points.stat(SEEN_STAT).clamp_min(1)
         mean, least = points.stat(GRAD_STAT) / seen, self.threshold
         if self.split_threshold is not None:  # in multiples of the threshold, so that both kinds can be compared

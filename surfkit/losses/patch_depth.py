@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
 from surfkit.losses.base import Loss, Target
+from surfkit.losses.depth import DEPTH_MAPS, inverse_depths, require_weights_and_band
 from surfkit.raster.api import Maps
 from surfkit.scene.align import SCALE_BAND
 
@@ -52,34 +52,21 @@ class PatchDepth(Loss):
     median over all photographs."""
 
     def __post_init__(self) -> None:
-        if not (self.start > 0 and self.end > 0):
-            raise BadInput(f"the patch-depth loss has start {self.start:g} and end {self.end:g}; both must be above 0")
+        require_weights_and_band("patch-depth", (self.start, self.end), self.scale_band)
         if self.patch < 4:
             raise BadInput(f"the patch-depth loss has patches of {self.patch} pixels; give 4 or more")
-        if not 0 < self.scale_band[0] <= 1 <= self.scale_band[1] < float("inf"):
-            raise BadInput(
-                f"the patch-depth loss has scale_band {self.scale_band[0]:g} {self.scale_band[1]:g}; give a multiple "
-                "above 0 and at most 1, and one of at least 1"
-            )
 
     @property
     def reads(self) -> tuple[str, ...]:  # type: ignore[override]  # it depends on a setting
         """The maps of the depth that is compared."""
-        return ("median",) if self.depth == "median" else ("alpha", "depth")
+        return DEPTH_MAPS[self.depth]
 
     def weight_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        depth = maps.need("median") if self.depth == "median" else maps.expected_depth()
-        prior = target.prior
-        if prior is None:
-            return 0 * depth.sum()
-        there = (depth > 0) & (prior.inverse > 0)
-        weight = torch.where(there, prior.confidence, 0)
-        rendered = torch.where(there, 1 / (torch.where(there, depth, 1) * prior.typical), 0)
-        estimated = torch.where(there, prior.inverse / prior.typical, 0)
-        side = min(self.patch, *depth.shape)
+        rendered, estimated, weight = inverse_depths(maps, target, self.depth)
+        side = min(self.patch, *weight.shape)
         weights = patches(weight, side, target.seed)
         weights = weights * (weights.sum(1, keepdim=True) >= KNOWN_SHARE * side * side)
         near, far = [], []

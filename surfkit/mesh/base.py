@@ -15,7 +15,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput, expect
 from surfkit.core.registry import Component
 from surfkit.io.datasets.depth_prior import DepthPrior
-from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.scene import Frame, View
 
 MAX_NESTING = 50

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Frame, View
 

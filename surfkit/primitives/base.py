@@ -17,7 +17,8 @@ from surfkit.primitives.columns import SIGMOID, Activation, Column
 from surfkit.primitives.draws import normals
 from surfkit.primitives.points import Columns
 from surfkit.primitives.raw import cloud_of, raw_columns
-from surfkit.raster.api import PRIMITIVE_KINDS, Rasterizer, Render, Splats
+from surfkit.raster.api import PRIMITIVE_KINDS, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints
 

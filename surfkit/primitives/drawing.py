@@ -11,7 +11,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.registry import kebab
 from surfkit.primitives.base import Primitive
-from surfkit.raster.api import Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 
 

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.culling import boxes_may_touch
 from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.raster.validate import validate

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, T_MIN, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, T_MIN, Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.projection import ProjectedSplats, footprints
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera

@@ -10,7 +10,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components, unknown
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 
 Device = str
 """auto, cpu, cuda, a GPU such as cuda:1, or the name of a registered rasterizer."""

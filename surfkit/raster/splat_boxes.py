@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from surfkit.raster.api import Splats
+
 
 @dataclass
 class SplatBoxes:
@@ -28,7 +30,7 @@ class SplatBoxes:
     scale: Tensor
 
     @classmethod
-    def of(cls, splats: api.Splats, size: int) -> SplatBoxes:
+    def of(cls, splats: Splats, size: int) -> SplatBoxes:
         """The boxes around each `size` of N splats, in their order; the last block may have fewer."""
         pad = -len(splats) % size
         means, scales = splats.means.detach().float(), splats.scales.detach().float().amax(1)
@@ -51,12 +53,9 @@ class SplatBoxes:
         """Those of (K,) indices."""
         return replace(self, low=self.low[rows], high=self.high[rows], scale=self.scale[rows])
 
-    def widen(self, blocks: Tensor, splats: api.Splats) -> None:
+    def widen(self, blocks: Tensor, splats: Splats) -> None:
         """Take in R splats, each into the box of its block, (R,) int64."""
         means, into = splats.means.detach().float(), blocks[:, None].expand(-1, 3)
         self.low.scatter_reduce_(0, into, means, "amin")
         self.high.scatter_reduce_(0, into, means, "amax")
         self.scale.scatter_reduce_(0, blocks, splats.scales.detach().float().amax(1), "amax")
-
-
-import surfkit.raster.api as api  # noqa: E402 (at the end, and as a module: each of the two names a class of the other)

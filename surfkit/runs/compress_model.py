@@ -22,7 +22,7 @@ from surfkit.core.registry import name_of
 from surfkit.densify.trim import Trim
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.psnr import psnr
 from surfkit.runs.context import RunContext
 from surfkit.runs.folder import Run

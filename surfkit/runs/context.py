@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.runs.folder import Run
 from surfkit.runs.run_cache import RunCache
 from surfkit.runs.run_stage import Intervals

@@ -31,7 +31,8 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.memory import is_out_of_memory, peak_memory_bytes
 from surfkit.core.registry import plugins
 from surfkit.io.datasets.read import read
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.runs.folder import Run, RunStage
 from surfkit.runs.photo_light import held_out_response

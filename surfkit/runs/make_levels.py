@@ -30,7 +30,8 @@ from surfkit.evaluate.images.measure_images import Draw, evaluate_views, frames_
 from surfkit.io.datasets.masks import mask_cache
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.runs.context import RunContext
 from surfkit.runs.folder import Run
 from surfkit.runs.methods.base import Reconstruction

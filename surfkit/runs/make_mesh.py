@@ -31,7 +31,8 @@ from surfkit.mesh.stereo import points
 from surfkit.mesh.value_colors import by_value, ends_of, words_of
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import DEFAULT_NEAR
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps
+from surfkit.raster.base import Rasterizer
 from surfkit.runs.folder import Run
 from surfkit.runs.mesh_output import MeshOutput
 from surfkit.runs.methods.base import Reconstruction

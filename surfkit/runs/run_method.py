@@ -29,7 +29,8 @@ from surfkit.mesh.base import VALUES, Mesh, require_values
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, torch_device
 from surfkit.runs.command import train_command

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.runs.context import RunContext
 from surfkit.runs.folder import Run, RunStage, discard_results
 from surfkit.runs.journal import record_events

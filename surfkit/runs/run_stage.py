@@ -18,7 +18,8 @@ from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Points
 from surfkit.primitives.storage import Storage
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.nvrtc.gpu_memory import peak_gpu_bytes
 from surfkit.raster.select import Device, select
 from surfkit.runs.folder import Run, RunStage

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.reference import Reference
 from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera

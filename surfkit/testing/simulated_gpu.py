@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.nvrtc import modules
 from surfkit.raster.nvrtc.emulated import Emulated
 from surfkit.raster.splat_boxes import SplatBoxes

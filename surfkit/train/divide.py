@@ -26,7 +26,8 @@ from surfkit.primitives.draws import SharedDraws, normals
 from surfkit.primitives.edit import ROW_FIELDS, Edit, apply_in_place, merge, sound
 from surfkit.primitives.points import Points
 from surfkit.primitives.smoothing import INTERVAL
-from surfkit.raster.api import STANDARD, Rasterizer, Splats
+from surfkit.raster.api import STANDARD, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.train.processes import Processes
 from surfkit.train.stage import Stage

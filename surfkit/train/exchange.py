@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import STANDARD, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer, NativeRender, maps_made, may_touch
 from surfkit.raster.strips import Strip, colors, colors_backward, contribution, leading, pixel_rows, tile_rows
 from surfkit.scene.camera import Camera

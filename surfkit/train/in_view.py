@@ -12,7 +12,8 @@ from surfkit.core.registry import name_of
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import draws_itself
 from surfkit.primitives.points import Columns, Points
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 from surfkit.train.point_blocks import SORTED_EVERY, PointBlocks, put_in_order
 from surfkit.train.setup import StageSetup

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns, Points
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 from surfkit.scene.morton import morton_order

@@ -14,7 +14,7 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Points
 from surfkit.primitives.storage import Storage
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.scene import View
 from surfkit.train.exchange import DividedRasterizer
 from surfkit.train.neighbour_selector import NeighbourSelector

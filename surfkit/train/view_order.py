@@ -10,7 +10,8 @@ from torch import Tensor
 
 from surfkit.core.lazy import Lazy
 from surfkit.densify.base import Contribution
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import MAPS, STANDARD, Maps, Rasterizer
+from surfkit.raster.api import MAPS, STANDARD, Maps
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.cuda.rasterizer import TileRasterizer, source
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.nvrtc.emulated import Emulated

@@ -12,7 +12,8 @@ from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import PrimitiveRasterizer, draws_itself
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.reference import Reference, draw
 

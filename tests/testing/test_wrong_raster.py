@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.reference import Reference
 from surfkit.testing import check_rasterizer
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from surfkit.primitives import Surfel2D
-from surfkit.raster.api import Rasterizer, Splats
+from surfkit.raster.api import Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import SparsePoints, View
 

@@ -22,6 +22,7 @@ MAX_POINTS_PER_PIXEL = 0.3
 ten times that, a tenth. Runs of 2DGS on 87 photographs of 160 px came to 0.33 in 2,000 steps, and to 0.03 and 0.04 in
 15,000 and 30,000 steps at ten times the threshold."""
 USUAL_THRESHOLD = 2e-4
+"""Threshold of gradients, with signs, that 3DGS and 2DGS publish; the sizes of gradients are larger."""
 FORECAST_SPREAD_FACTOR = 3.0
 """The true number may be smaller or larger by this factor."""
 USUAL_EVERY = 100
@@ -74,8 +75,8 @@ def growth(stage: Stage, first: int, pixels: int, given: int | None = None, is_d
         return Growth(first, first, (), True)
     edits = edit_shares(stage.densify, stage.steps)
     most, share = DENSE_FACTOR if is_dense else MAX_FACTOR, MAX_POINTS_PER_PIXEL
-    if isinstance(stage.densify, ADC) and stage.densify.threshold > 0:
-        share *= min(1.0, USUAL_THRESHOLD / stage.densify.threshold)
+    if isinstance(stage.densify, ADC) and not (is_dense or stage.signal.absolute):
+        share *= USUAL_THRESHOLD / max(stage.densify.threshold, USUAL_THRESHOLD)
     likely = max(first, min(round(first * factor(len(edits), most)), round(share * pixels)))
     limit = stage.densify.most_points
     last = given if given is not None else min(likely, max(limit or likely, first))

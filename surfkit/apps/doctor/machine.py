@@ -15,7 +15,7 @@ import torch
 from surfkit.core.registry import Plugin, components, records
 from surfkit.core.version import own_version
 from surfkit.raster import native
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,8 @@ from surfkit.train.trainer import Trainer
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""
 PART_S = 0.4
-"""Cheap steps are taken for so long in each part, since a few of them tell little of the others."""
+"""Cheap steps are taken for so long in each part, since a few of them tell little of the others; but no more where the
+next one may add points, as the part is to be measured with so many."""
 EDITED = 0.05
 """Share of the points that go, and of those that come, in the edit of each part: an edit holds the points several times
 over."""
@@ -295,8 +296,10 @@ def _taken(
     wanted = max(WARM + 1, job.steps // len(job.parts))
     times: list[tuple[bool, float]] = []
     begun = time.perf_counter()
-    spent = 0.0
-    while (len(times) < wanted or spent < PART_S) and state.index < trainer.stage.steps:
+    spent, edits = 0.0, _edits(trainer.stage)
+    while state.index < trainer.stage.steps:
+        if len(times) >= wanted and (spent >= PART_S or state.index + 1 in edits):
+            break
         times.append(_timed(trainer, state))
         spent = time.perf_counter() - begun
         if spent > job.seconds / len(job.parts) and len(times) > WARM:
@@ -311,6 +314,12 @@ def _taken(
         seconds += statistics.median(own) * len(indices) / sum(map(len, kinds.values()))
     divisor = trainer.stage.divisor_at(part.index + 1)
     return SegmentCosts(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes(), divisor)
+
+
+def _edits(stage: Stage) -> Sequence[int]:
+    """The steps that may add points; all of them where the densifier does not tell."""
+    known = () if stage.densify is None else stage.densify.edits(stage.steps)
+    return range(1, stage.steps + 1) if known is None else known
 
 
 def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:

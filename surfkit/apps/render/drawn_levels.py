@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from statistics import median
 
 from surfkit.compress.levels.lod_tree import LodTree
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.scene import View
 
 

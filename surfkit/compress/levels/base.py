@@ -11,7 +11,7 @@ from surfkit.compress.levels.lod_tree import LodTree
 from surfkit.core.registry import Component
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.scene import Frame, View
 
 

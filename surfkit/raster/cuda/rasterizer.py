@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
 from surfkit.raster.nvrtc.modules import Kernels

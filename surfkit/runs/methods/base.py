@@ -15,7 +15,8 @@ from surfkit.core.registry import Component
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.mesh.base import Mesh
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.base import Rasterizer
 from surfkit.scene.scene import Scene, View
 
 

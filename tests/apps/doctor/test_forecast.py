@@ -217,8 +217,7 @@ def tiny(farm, tmp_path):
     return ProbeJob(recipe, some(scene, scene.train[:3]), parts(300, 900), 8, 60.0, True)
 
 
-def test_what_a_probe_measures(farm, tmp_path, monkeypatch):
-    monkeypatch.setattr("surfkit.apps.doctor.probe.PART_S", 0.0)  # so few steps that none of them adds points
+def test_what_a_probe_measures(farm, tmp_path):
     started, *taken, written = measure(tiny(farm, tmp_path))
     assert started.held_bytes >= 3 * (3 + 8) * 40 * 30 and started.photo_seconds > 0
     assert [abs(one.points / wanted - 1) < 0.1 for one, wanted in zip(taken, (300, 900), strict=True)] == [True] * 2
