@@ -9,7 +9,7 @@ import torch
 
 from surfkit.mesh.opacity_surface import OpacitySurface
 from surfkit.mesh.solid_depth import solid_depth
-from surfkit.plugin import TSDF, BadInput, Maps, Mesh, Mesher, MeshInput, View
+from surfkit.plugin import TSDF, BadInput, Maps, Mesh, Mesher, MeshInput, View, Warned, emit
 from surfkit.primitives.drawing import PrimitiveRasterizer
 
 
@@ -18,10 +18,16 @@ class SolidField(OpacitySurface):
     """Marching tetrahedra on the boxes of the splats, where half of the light reaches a place through stochastic solids
     from the view that sees it best (GGGS, after GOF).
 
-    Splats other than Gaussians hide as for mesh:gof.
+    Splats other than Gaussians hide as for mesh:gof, with a warning.
     """
 
     solid: ClassVar[bool] = True
+
+    def mesh(self, subject: MeshInput) -> Mesh:
+        """See `Mesher.mesh`."""
+        if not are_solids(subject):
+            emit(Warned(f"mesh:gggs: {subject.splats.kind} splats are no solids; they hide as for mesh:gof"))
+        return super().mesh(subject)
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,8 @@ class SolidTSDF(Mesher):
     """Fuse depth as mesh:tsdf does, but where half of each ray is left open by stochastic solids (GGGS, eq. 10).
 
     It takes the place of the median depth; normals and colours are those that are drawn. Splats other than Gaussians
-    keep their median depth.
+    keep their median depth, with a warning. `facts` of the mesh tell the share of the pixels with a median depth in
+    which none of solids was found.
     """
 
     fusion: TSDF = field(default_factory=TSDF)
@@ -46,15 +53,25 @@ class SolidTSDF(Mesher):
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
-        splats = subject.splats
-        if splats.kind != "gaussian" or isinstance(subject.rasterizer, PrimitiveRasterizer):
+        if not are_solids(subject):
+            emit(Warned(f"mesh:gggs-tsdf: {subject.splats.kind} splats are no solids; their median depth is fused"))
             return self.fusion.mesh(subject)
+        pixels = {"drawn": 0, "found": 0}
 
         def draw(view: View) -> Maps:
             with torch.no_grad():
                 maps = subject.draw(view)
                 median = maps.need("median")
-                depth = solid_depth(splats, view.camera, subject.near, median)
+                depth = solid_depth(subject.splats, view.camera, subject.near, median)
+            pixels["drawn"] += int((median > 0).sum())
+            pixels["found"] += int((depth > 0).sum())
             return replace(maps, median=depth.to(median))
 
-        return self.fusion.mesh(replace(subject, draw=draw, draw_of=None))
+        mesh = self.fusion.mesh(replace(subject, draw=draw, draw_of=None))
+        lost = 1 - pixels["found"] / max(1, pixels["drawn"])
+        return replace(mesh, facts={**mesh.facts, "pixels_without_solid_depth": lost})
+
+
+def are_solids(subject: MeshInput) -> bool:
+    """Whether the splats are Gaussians that a rasterizer draws, and not a primitive itself."""
+    return subject.splats.kind == "gaussian" and not isinstance(subject.rasterizer, PrimitiveRasterizer)
