@@ -116,8 +116,9 @@ def test_one_splat_counts_in_part_for_points_that_lie_in_it():
 
 
 @needs_native
+@pytest.mark.parametrize("solid", [False, True])
 @pytest.mark.parametrize("kernels", ["avx512", "avx2", "baseline"])
-def test_every_compilation_agrees(kernels):
+def test_every_compilation_agrees(kernels, solid):
     module = native.module()
     if kernels not in module.kernels():
         pytest.skip(f"this machine cannot run {kernels}")
@@ -127,7 +128,7 @@ def test_every_compilation_agrees(kernels):
     try:
         for name in (best, kernels):
             module.use_kernels(name)
-            found.append(ray_opacity(splats, view, NEAR, points).nan_to_num())
+            found.append(ray_opacity(splats, view, NEAR, points, solid).nan_to_num())
     finally:
         module.use_kernels(best)
     assert ((found[0] - found[1]).abs() > 1e-4).float().mean() < 0.01 and (found[0] - found[1]).abs().median() < 1e-6
