@@ -52,13 +52,18 @@ def vignetting(x, y, corner):
 
 
 def flown_ground(folder, stops=1.0, balance=0.15, corner=0.6, seed=0, cell=0.25):
-    """The scene with its photographs in a folder, with exposures of so many stops up and down, and so on."""
+    """The scene with its photographs in a folder, with exposures of so many stops up and down, and so on, which have no
+    trend over the ground."""
     draw, views, gain = np.random.default_rng(seed), [], []
     row, column = np.mgrid[:DEPTH, :WIDTH] + 0.5
     frame = Frame(np.zeros(3), 0.1, 1.0)
     spots = [(x, y) for y in np.linspace(-6, 6, DOWN) for x in np.linspace(-6, 6, ACROSS)]
-    for at, (x, y) in enumerate(spots):
-        factor = 2 ** draw.uniform(-stops, stops) * (1 + draw.uniform(-balance, balance, 3))
+    factors = draw.uniform(-stops, stops, (len(spots), 1)) + np.log2(
+        1 + draw.uniform(-balance, balance, (len(spots), 3))
+    )
+    trend = np.column_stack([spots, np.ones(len(spots))])  # over flat ground, it cannot be told from a bright side
+    factors -= trend[:, :2] @ np.linalg.lstsq(trend, factors, rcond=None)[0][:2]
+    for at, ((x, y), factor) in enumerate(zip(spots, 2**factors, strict=True)):
         turn = np.deg2rad(draw.uniform(-8, 8))
         cos, sin = np.cos(turn), np.sin(turn)
         pose = np.eye(4)

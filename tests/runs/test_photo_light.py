@@ -23,7 +23,8 @@ from surfkit.runs.recipe import Recipe
 from surfkit.runs.start import InitialPointBuilder
 from surfkit.scene.photos import view_photo
 from surfkit.scene.srgb import from_linear, linear
-from surfkit.scene.track_light import TrackColors, TrackLight
+from surfkit.scene.track_colors import TrackColors
+from surfkit.scene.track_light import TrackLight
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.data_cache import TrainingData
@@ -126,7 +127,9 @@ def test_the_scene_is_as_bright_as_the_mean_photograph(data, falloff):
     """A fit may centre the vignetting far from the middle, where what it takes from the middle means nothing."""
     views = read(data).train
     stops = np.array([[0.5, 0.5, 0.5], [-0.5, -0.5, -0.5]] * (len(views) // 2))
-    light = TrackLight(stops, np.array([[*falloff, -0.8, -0.5, 0, 0, 0]]), np.full(len(views), 99), 0.01)
+    light = TrackLight(
+        stops, np.array([[*falloff, -0.8, -0.5, 0, 0, 0]]), np.zeros((3, 3)), np.full(len(views), 99), 0.01
+    )
     record = recorded(light, views)
     grey = torch.full((3, 48, 64), 0.3)
     model, known = (
@@ -142,7 +145,8 @@ def test_the_scene_is_as_bright_as_the_mean_photograph(data, falloff):
 
 def test_light_of_earlier_versions_is_taken_as_it_was(data, tmp_path):
     record = recorded(
-        TrackLight(np.zeros((1, 3)), np.array([[1.0, *[0.0] * 7]]), np.array([99]), 0.01), read(data).train[:1]
+        TrackLight(np.zeros((1, 3)), np.array([[1.0, *[0.0] * 7]]), np.zeros((3, 3)), np.array([99]), 0.01),
+        read(data).train[:1],
     )
     assert record.cameras["camera 1"].mean == pytest.approx(1 / 3, rel=0.02)  # the mean of r^2
     before = asdict(record)
@@ -212,7 +216,7 @@ def test_light_that_is_uneven_in_some_photographs_alone_changes_nothing(data, re
     def fit(views, tracks):
         looked.append(len(views))
         stops = np.linspace(-1, 1, len(views))[:, None] * (1.0 if len(views) == 5 else 0.1) * np.ones(3)
-        return TrackLight(stops, np.zeros((1, 8)), np.full(len(views), 99), 0.01)
+        return TrackLight(stops, np.zeros((1, 8)), np.zeros((3, 3)), np.full(len(views), 99), 0.01)
 
     monkeypatch.setattr(photo_light, "light_by_tracks", fit)
     looks = replace(recipe, pretrain=replace(recipe.pretrain, appearance=CameraResponse("uneven")))

@@ -11,8 +11,11 @@ from surfkit.apps.doctor.finding import Finding
 from surfkit.apps.doctor.gather import Gathered
 from surfkit.apps.doctor.geometry import seen_by
 from surfkit.io.datasets.photo_cameras import cameras_of
+from surfkit.io.datasets.undistort import is_panorama
 from surfkit.runs.recipe import Recipe
-from surfkit.scene.track_light import MIN_SEEN, LightSpread, TrackColors, fit_light
+from surfkit.scene.light_spread import LightSpread
+from surfkit.scene.track_colors import TrackColors, sensor_axes
+from surfkit.scene.track_light import MIN_SEEN, fit_light
 
 MIN_PHOTOGRAPHS = 3
 """Photographs that are compared, at least."""
@@ -35,18 +38,21 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
     without, looking = recipe.without_appearance, recipe.looks_for_uneven_light
     if len(shots) < MIN_PHOTOGRAPHS or not (without or looking):
         return []
-    parts = []
+    parts, axes = [], np.zeros((len(shots), 3, 2))
     for at, shot in enumerate(shots):
         camera, share = shot.camera, seen_by(shot, xyz)()
         rows = np.flatnonzero(np.isfinite(share).all(1))
         size = np.array([camera.width, camera.height])
         middle = np.array([camera.principal_point_x, camera.principal_point_y])
-        place = (share[rows] * size - middle) * 2 / np.hypot(*size)
+        scale = 2 / float(np.hypot(*size))
+        place = (share[rows] * size - middle) * scale
+        if not is_panorama(camera):  # which looks all around itself
+            axes[at] = sensor_axes(shot.pose[:3, :3], (camera.focal_length_x, camera.focal_length_y), scale)
         parts.append((np.full(len(rows), at), rows, place, colors[shot.name][rows]))
     names = cameras_of(shots)
     cameras = {name: row for row, name in enumerate(dict.fromkeys(names))}
     tracks = TrackColors(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    light = fit_light(tracks, np.array([cameras[name] for name in names]))
+    light = fit_light(tracks, np.array([cameras[name] for name in names]), axes)
     spread = LightSpread.of(light)
     if not spread.is_uneven:
         return []

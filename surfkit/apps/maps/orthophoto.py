@@ -27,7 +27,6 @@ from surfkit.apps.texture.resolution import pixel_sizes
 from surfkit.apps.texture.texture_cache import TextureCache
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos, local_mesh, reduced
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.scene.radiometry import exposed
 from surfkit.scene.scene import Frame
 
 BANDS = 5
@@ -233,8 +232,8 @@ class Square:
         sight = look(source.frame.to_local(grid.from_cells(places)), camera, source.pieces, source.photos.keep(photo))
         if not len(sight.rows):
             return
-        gain = source.regions.light.gains_at(photo, camera, sight.x, sight.y)
-        color = exposed(between(source.photos(photo), sight.x, sight.y) / 255, gain)
+        shown = between(source.photos(photo), sight.x, sight.y) / 255
+        color = source.regions.light.even(shown, photo, camera, sight.x, sight.y)
         color = np.rint(255 * FINE * color).astype(np.int16)
         cells = cells[sight.rows]
         found = np.where(sight.clear, *(each.reshape(-1)[cells] for each in ranks))

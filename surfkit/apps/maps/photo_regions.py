@@ -9,7 +9,7 @@ more on what rises above its surroundings. Alpha expansion finds a low sum.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos
 from surfkit.apps.texture.texture_cache import Arrays, TextureCache
 from surfkit.apps.texture.triangle_visibility import EDGE_QUALITY, TriangleVisibility
 from surfkit.scene.camera import Camera
-from surfkit.scene.radiometry import Radiometry, exposed, vignetting_terms
+from surfkit.scene.one_light import OneLight, sensor_places
 from surfkit.scene.scene import Frame, View
 
 MIN_BLOCK_CELLS, MAX_BLOCKS = 4, 1_000_000
@@ -62,13 +62,13 @@ class PhotoRegions:
         block: Cells along a side of a block.
         label: (h, w) int32 photograph of each block; NO_PHOTO where none shows it.
         view: (h, w, K) int32 the photographs that show it best, in this order; NO_PHOTO for none.
-        light: What that of photographs is multiplied by.
+        light: Of the photographs.
     """
 
     block: int
     label: np.ndarray
     view: np.ndarray
-    light: Radiometry
+    light: OneLight
 
 
 class Blocks:
@@ -139,9 +139,9 @@ class Blocks:
         mean = np.stack([np.bincount(at, each) for each in (*colors.T, sight.x, sight.y)], axis=1) / count[:, None]
         good = np.bincount(at, np.where(sight.clear, 1.0, EDGE_QUALITY**0.5)) / self.count[rows[used]]
         quality = np.bincount(at, self._qualities(places[sight.rows], sight.x, sight.y, camera)) / count * good**2
-        terms = vignetting_terms(camera, mean[:, 3], mean[:, 4])
+        place = sensor_places(camera, mean[:, 3], mean[:, 4])
         color = np.rint(mean[:, :3]).astype(np.uint8)
-        return TriangleVisibility(rows[used], quality.clip(1e-6).astype(np.float32), color, terms)
+        return TriangleVisibility(rows[used], quality.clip(1e-6).astype(np.float32), color, place)
 
     def _qualities(self, places: np.ndarray, x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
         """(n,) pixels that a level cell takes, times the cosine to the vertical, less towards the border."""
@@ -174,16 +174,15 @@ class RegionEnergy:
 
     Args:
         found: The photographs of each block.
-        light: What theirs is multiplied by.
+        light: Of the photographs.
         weight: (h, w) of a cut line at each block.
     """
 
-    def __init__(self, found: Candidates, light: Radiometry, weight: np.ndarray) -> None:
+    def __init__(self, found: Candidates, light: OneLight, weight: np.ndarray) -> None:
         self.view = found.view
         best = np.maximum(found.quality.max(1, keepdims=True), 1e-30)
         self.lack = 1 - found.quality / best
-        gain = light.at_terms(found.view, found.terms.astype(np.float32))
-        self.color = exposed(found.color / np.float32(255), gain).astype(np.float32)
+        self.color = light.even_at(found.color / 255, found.view, found.place.astype(float)).astype(np.float32)
         number = np.arange(weight.size).reshape(weight.shape)
         known = found.view.max(1) != NO_PHOTO
         ends = np.concatenate([
@@ -267,7 +266,7 @@ def find_regions(
     kept.forget(LOOKED_FOLDER)
     label = chosen["label"].reshape(blocks.shape).astype(np.int32)
     view = chosen["view"].reshape(*blocks.shape, -1)
-    return PhotoRegions(blocks.size, label, view, Radiometry(chosen["gain"], chosen["vignetting"]))
+    return PhotoRegions(blocks.size, label, view, OneLight(*(chosen[field.name] for field in fields(OneLight))))
 
 
 def flight_height(views: Sequence[View], frame: Frame, grid: MapGrid, height: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from surfkit.apps.texture.candidates import NO_PHOTO, Candidates
 from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
-from surfkit.scene.radiometry import Radiometry
+from surfkit.scene.one_light import OneLight
 
 SEAM_COST, SEAM_DIFFERENCE = 2.0, 0.04
 """Cost of an edge between two photographs where colours differ so much, of 1, and in proportion elsewhere; that of a
@@ -36,12 +36,12 @@ PART = 1 << 17
 """Triangles at once."""
 
 
-def choose_views(found: Candidates, light: Radiometry, beyond: np.ndarray, edge: np.ndarray) -> np.ndarray:
+def choose_views(found: Candidates, light: OneLight, beyond: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """(F,) int32 number of the photograph of each triangle; NONE where none shows it.
 
     Args:
         found: What can be chosen.
-        light: What that of the photographs is multiplied by.
+        light: Of the photographs.
         beyond: (F, 3) triangles beyond the edges, see `neighbours`.
         edge: (F, 3) edges of theirs.
     """

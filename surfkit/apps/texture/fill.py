@@ -16,7 +16,7 @@ from surfkit.apps.texture.seam_levelling import SeamCorrections, levelled
 from surfkit.apps.texture.texture_atlas import PATCH_SIDE, Atlas, AtlasPage
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
-from surfkit.scene.radiometry import Radiometry, exposed
+from surfkit.scene.one_light import OneLight
 
 Pictures = Literal["jpeg", "png"]
 PAGE_JPEG_QUALITY = 92
@@ -35,14 +35,14 @@ class PaintInput:
         mesh: The mesh.
         atlas: Where its triangles lie.
         photos: The photographs.
-        light: What theirs is multiplied by.
+        light: Theirs.
         levels: What is added to these colours.
     """
 
     mesh: Mesh
     atlas: Atlas
     photos: PrefetchedPhotos
-    light: Radiometry
+    light: OneLight
     levels: SeamCorrections
 
 
@@ -86,13 +86,13 @@ def _colors(
     owner: np.ndarray,
     texel: np.ndarray,
 ) -> np.ndarray:
-    """(n, 3) uint8 colours of texels that show one photograph: pixels of it, times their gains, plus the correction."""
+    """(n, 3) uint8 colours of texels that show one photograph: pixels of it in one light, plus the correction."""
     row, column = np.divmod(texel, owner.shape[1])
     mine = owner.reshape(-1)[texel]
     x, y = (np.stack([column, row], axis=1) - what.atlas.move[what.atlas.chart[faces[mine]]]).T
     x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
-    gain = what.light.gains_at(number, what.photos.views[number].camera, x + 0.5, y + 0.5)
-    shown = exposed(picture[:, y, x].T / 255, gain)
+    camera = what.photos.views[number].camera
+    shown = what.light.even(picture[:, y, x].T / 255, number, camera, x + 0.5, y + 0.5)
     a, b, c = corners[mine].transpose(1, 0, 2).astype(np.float64)
     p, ahead, across = np.stack([column + 0.5, row + 0.5], axis=1) - a, b - a, c - a
     area = ahead[:, 0] * across[:, 1] - across[:, 0] * ahead[:, 1]

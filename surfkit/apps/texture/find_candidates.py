@@ -13,7 +13,7 @@ from surfkit.apps.texture.texture_cache import TextureCache
 from surfkit.apps.texture.triangle_visibility import TriangleVisibility
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, Progress, emit
-from surfkit.scene.radiometry import Radiometry, camera_numbers, estimate
+from surfkit.scene.one_light import OneLight
 
 LOOKED_FOLDER, PAUSE_S, SAVE_PAUSE_FACTOR = "looked", 20.0, 30.0
 """What was seen in the photographs so far is kept every `PAUSE_S` seconds, or `SAVE_PAUSE_FACTOR` times as long as that
@@ -27,8 +27,8 @@ def candidates_of(
     photos: PrefetchedPhotos,
     show: Show,
     kept: TextureCache = TextureCache(),
-    light: Radiometry | None = None,
-) -> tuple[Candidates, Radiometry, int]:
+    light: OneLight | None = None,
+) -> tuple[Candidates, OneLight, int]:
     """What can be chosen from, the light of the photographs, and how many photographs of a place were refused.
 
     Args:
@@ -59,6 +59,6 @@ def candidates_of(
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, len(photos.views)))
-    light = light or estimate(found.shared(), camera_numbers([view.camera for view in photos.views]))
+    light = light or OneLight.of(photos.views, found.shared(len(photos.views)))
     found.shun_clipped()
     return found, light, found.refuse_outliers(light)

@@ -17,7 +17,7 @@ from surfkit.apps.texture.candidates import NO_PHOTO
 from surfkit.apps.texture.prefetch_photos import PrefetchedPhotos, by_photograph
 from surfkit.apps.texture.topology import NO_FACE as NO_FACE
 from surfkit.core.events import Progress, emit
-from surfkit.scene.radiometry import Radiometry, exposed
+from surfkit.scene.one_light import OneLight
 
 SAMPLES_PER_EDGE = 5
 """Along each edge of a seam."""
@@ -52,7 +52,7 @@ def level(
     places: np.ndarray,
     beyond: np.ndarray,
     photos: PrefetchedPhotos,
-    light: Radiometry,
+    light: OneLight,
 ) -> SeamCorrections:
     """Find the values.
 
@@ -62,7 +62,7 @@ def level(
         places: (F, 3, 2) corners in the photograph.
         beyond: (F, 3) triangles beyond the edges.
         photos: The photographs.
-        light: What theirs is multiplied by.
+        light: Theirs.
     """
     seen = np.flatnonzero(view != NO_PHOTO)
     count = len(photos.views)
@@ -99,7 +99,7 @@ def _seam_colors(
     places: np.ndarray,
     seam: tuple[np.ndarray, np.ndarray],
     photos: PrefetchedPhotos,
-    light: Radiometry,
+    light: OneLight,
     count: int,
 ) -> np.ndarray:
     """(n, 3) float64 mean colours of photographs at the vertices of seams, along the seams; elsewhere 0."""
@@ -113,8 +113,8 @@ def _seam_colors(
         for share in (np.arange(SAMPLES_PER_EDGE) + 0.5) / SAMPLES_PER_EDGE:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)
             x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
-            gain = light.gains_at(number, photos.views[number].camera, x + 0.5, y + 0.5)
-            shown = exposed(picture[:, y, x].T / 255, gain)
+            camera = photos.views[number].camera
+            shown = light.even(picture[:, y, x].T / 255, number, camera, x + 0.5, y + 0.5)
             for at, weight in ((corner[f, e], 1 - share), (corner[f, (e + 1) % 3], share)):
                 np.add.at(sums, at, weight * shown)
                 np.add.at(weights, at, weight)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,7 +39,7 @@ from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
-from surfkit.scene.radiometry import Radiometry
+from surfkit.scene.one_light import OneLight
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d", "usdz"]
@@ -167,7 +167,6 @@ def refuse_unplaced(frame: Frame, geoid: str | None) -> None:
 def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
     """What texture.json says of a textured mesh."""
     mesh, atlas, light = made.paint.mesh, made.paint.atlas, made.paint.light
-    corners = light.corners([view.camera for view in subject.views])
     seen, areas = atlas.view != NO_PHOTO, areas_of(mesh.vertices, mesh.faces)
     return {
         "mesh": str(subject.surface.path),
@@ -180,8 +179,8 @@ def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),
         "photographs": len(np.unique(atlas.view[seen])),
         "outliers": made.outliers,
-        "gains": [round(float(light.gain.min()), 4), round(float(light.gain.max()), 4)],
-        "corners": [round(float(corners.min()), 4), round(float(corners.max()), 4)],
+        "gains": [round(float(2**-stops), 4) for stops in (light.stops.max(), light.stops.min())],
+        "corners": [round(float(light.corners.min()), 4), round(float(light.corners.max()), 4)],
         "charts": len(atlas.page),
         "pages": [[page.width, page.height] for page in atlas.pages],
         "tiles": int(atlas.tile.max()) + 1,
@@ -195,7 +194,7 @@ def textured(
     kept: TextureCache = TextureCache(),
     finer: Mesh | None = None,
     region: Region | None = None,
-    light: Radiometry | None = None,
+    light: OneLight | None = None,
 ) -> TexturedMesh:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
@@ -235,7 +234,7 @@ def textured(
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
-    used = Radiometry(chosen["gain"], chosen["vignetting"])
+    used = OneLight(*(chosen[field.name] for field in fields(OneLight)))
     levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, used)))
     return TexturedMesh(
         PaintInput(mesh, atlas, photos, used, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()
@@ -333,8 +332,8 @@ def look_at_all(
     photos: PrefetchedPhotos,
     longest: float,
     kept: TextureCache = TextureCache(),
-    light: Radiometry | None = None,
-) -> tuple[Candidates, Radiometry, int]:
+    light: OneLight | None = None,
+) -> tuple[Candidates, OneLight, int]:
     """What can be chosen from, the light of the photographs, and how many photographs of a triangle were refused."""
     pieces = MeshClusters(mesh)
 

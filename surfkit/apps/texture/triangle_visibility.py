@@ -12,7 +12,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.depths import nearest
 from surfkit.raster.native import kernels, module
 from surfkit.scene.camera import Camera
-from surfkit.scene.radiometry import vignetting_terms
+from surfkit.scene.one_light import sensor_places
 
 HIDDEN_SLACK_PX = 2.0
 """How far a triangle may lie behind the nearest surface and be seen, in sides of a pixel at its depth."""
@@ -33,13 +33,13 @@ class TriangleVisibility:
         faces: (n,) their rows in the mesh, rising.
         quality: (n,) float32 pixels that they take, times the cosine between the ray and the normal.
         color: (n, 3) uint8 mean colours.
-        terms: (n, T) where in the photograph they lie, see `vignetting_terms`.
+        place: (n, 2) where on the sensor they lie, see `sensor_places`.
     """
 
     faces: np.ndarray
     quality: np.ndarray
     color: np.ndarray
-    terms: np.ndarray
+    place: np.ndarray
 
 
 def project(vertices: np.ndarray, camera: Camera) -> np.ndarray:
@@ -79,8 +79,8 @@ def sight(
     area = np.abs(ax * by - ay * bx) / 2
     quality = area * _cosine(mesh, camera, rows) * np.where(at_edge > 0, EDGE_QUALITY, 1.0)
     color = np.rint(sums[rows] / covered[rows, None]).astype(np.uint8)
-    terms = vignetting_terms(camera, *corners[:, :, :2].mean(1).T)
-    return TriangleVisibility(rows, np.maximum(quality, 1e-6).astype(np.float32), color, terms)
+    place = sensor_places(camera, *corners[:, :, :2].mean(1).T)
+    return TriangleVisibility(rows, np.maximum(quality, 1e-6).astype(np.float32), color, place)
 
 
 def _cosine(mesh: Mesh, camera: Camera, rows: np.ndarray) -> np.ndarray:

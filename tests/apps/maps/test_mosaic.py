@@ -14,13 +14,14 @@ from surfkit.apps.maps import orthophoto, photo_regions
 from surfkit.apps.maps.graph_cut import expanded
 from surfkit.apps.maps.make_maps import make_maps
 from surfkit.apps.maps.map_settings import MapSettings
-from surfkit.apps.texture import find_candidates
 from surfkit.apps.texture.texture_mesh import MeshWithPhotos
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
+from surfkit.scene import one_light
 from surfkit.scene.camera import Camera
-from surfkit.scene.radiometry import Radiometry
 from surfkit.scene.scene import Frame, Mask, View
 from surfkit.scene.srgb import from_linear, linear
+from surfkit.scene.track_colors import TrackColors
+from surfkit.scene.track_light import fit_light
 from surfkit.testing.synthetic import Box, GroundPlane
 
 rasterio = needs("rasterio")
@@ -30,7 +31,13 @@ HIDDEN = (20, 20, 230)
 """Colour of all vertices."""
 RED, GREEN = np.array([0.8, 0.1, 0.1]), np.array([0.2, 0.6, 0.2])
 """Of the box, and of the ground about."""
+NOTHING = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
 SETTINGS = MapSettings(products=("orthophoto",), colors="photographs", gsd=0.05, up="z", memory="100MB")
+
+
+def leave_the_light(monkeypatch):
+    """As if photographs shared nothing."""
+    monkeypatch.setattr(one_light, "fit_light", lambda _, *others: fit_light(NOTHING, *others))
 
 
 def ground_colors(places):
@@ -101,7 +108,7 @@ def test_two_photographs_of_other_exposure_have_no_seam(tmp_path):
 
 def test_what_light_is_not_known_is_blended(tmp_path, monkeypatch):
     """Photographs that differ by 22 levels, and gains that do not tell: the change takes many cells."""
-    monkeypatch.setattr(find_candidates, "estimate", lambda _, cameras: Radiometry.unchanged(len(cameras)))
+    leave_the_light(monkeypatch)
     monkeypatch.setattr(photo_regions, "MOST_SEAM", 1.0)
     scene = scene_of(tmp_path, [down(-2), down(2)], exposures=[1.0, 1.3])
     colors, numbers, places = drawn(scene, tmp_path / "maps")
@@ -158,7 +165,7 @@ def test_masked_pixels_are_not_used(tmp_path):
 
 def test_squares_do_not_show(tmp_path, monkeypatch):
     """Squares of any size come to the same: their margins are wide enough."""
-    monkeypatch.setattr(find_candidates, "estimate", lambda _, cameras: Radiometry.unchanged(len(cameras)))
+    leave_the_light(monkeypatch)
     scene = scene_of(tmp_path, [down(-2), down(2, 1)], Box((-1, -1, 0), (1, 1, 1)), [1.0, 1.3])
     found = []
     for side in (32, 96, 1024):

@@ -40,13 +40,20 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
-from surfkit.scene.radiometry import Radiometry, estimate
+from surfkit.scene.one_light import OneLight
 from surfkit.scene.scene import Frame, Mask
+from surfkit.scene.track_light import fit_light
 
 needs("fast_simplification")
 
 PNG = TextureSettings(triangles=100_000, pictures="png", size=1024)
 """Keeps all the triangles of the scene, and loses nothing in pictures."""
+
+
+def one_light(views):
+    """Of photographs that stay as they are."""
+    zero = np.zeros(views)
+    return OneLight(np.zeros((views, 3)), np.zeros((views, 2, 3)), zero, zero.astype(np.int64), np.zeros((1, 8)))
 
 
 def made(scene, out, settings=PNG):
@@ -157,7 +164,7 @@ def test_a_car_in_every_photograph_would_be_there(tmp_path):
     assert yellow.sum() > 4 and (found.view[yellow] == 3).all()
     before = yellow & (found.quality == found.quality.max(1, keepdims=True))
     assert before.any(), "it is the best photograph of some triangles"
-    found.refuse_outliers(Radiometry.unchanged(len(scene.views)))
+    found.refuse_outliers(one_light(len(scene.views)))
     assert not (found.view[yellow] == 3).any()
     assert (found.view != NO_PHOTO).any(1).mean() > 0.85, "others are left"
 
@@ -260,7 +267,7 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
     mesh, photos = local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8)
     found, light, _ = look_at_all(mesh, photos, 1000)
     wanted = np.exp(np.log(exposures).mean()) / exposures
-    assert np.abs(light.gain / wanted[:, None] - 1).max() < 0.04
+    assert np.abs(2.0**-light.stops / wanted[:, None] - 1).max() < 0.04
     beyond, edge = neighbours(mesh.faces)
     atlas, _ = lay_out(mesh, scene.views, choose_views(found, light, beyond, edge), beyond, 1024)
     steps = {}
@@ -278,7 +285,7 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
         arguments = mesh.faces, atlas.view, atlas.places, beyond, photos
         leveling.level(*arguments, light)
         fitted = dict(steps)
-        small = replace(light, gain=light.gain**0.25)  # what levelling alone can do, where gains are wrong
+        small = replace(light, stops=light.stops / 4)  # what levelling alone can do, where they are wrong
         leveling.level(*arguments, small)
     assert fitted["before"] < 0.5 * steps["before"]
     assert fitted["after"] <= fitted["before"] and steps["after"] < 0.6 * steps["before"]
@@ -396,7 +403,7 @@ def test_neighbours_get_the_same_photograph():
     """A strip of triangles that two photographs show about as well, in turns: one of the two is chosen for all."""
     places, faces = sheet((0, 0, 0), np.array([40.0, 0, 0]), np.array([0, 1.0, 0]), 1.0)
     found = Candidates(len(faces))
-    draw, light = np.random.default_rng(4).uniform(0.9, 1.0, (len(faces), 2)), Radiometry.unchanged(8)
+    draw, light = np.random.default_rng(4).uniform(0.9, 1.0, (len(faces), 2)), one_light(8)
     found.color[:] = 120
     found.color[:, 1] = 190
     found.view[:, :2], found.quality[:, :2] = [5, 7], draw
@@ -425,7 +432,7 @@ def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
     monkeypatch.setattr(pieces, "MAX_PIECE_TRIANGLES", 50)
     parts = look_at_all(mesh, photos, 1000)
     assert (whole[0].view == parts[0].view).all() and (whole[0].quality == parts[0].quality).all()
-    assert (whole[0].color == parts[0].color).all() and (whole[1].gain == parts[1].gain).all()
+    assert (whole[0].color == parts[0].color).all() and (whole[1].stops == parts[1].stops).all()
     strip, faces = sheet((-100, -1, 0), np.array([200.0, 0, 0]), np.array([0, 2.0, 0]), 0.5)
     divided = MeshClusters(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
     for x in (-150.0, -99.0, 0.0, 60.0):
@@ -441,9 +448,11 @@ def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures, cell=0.25)
     found, light, _ = look_at_all(local_mesh(scene.surface, scene.frame), PrefetchedPhotos(scene.views, 10**8), 1000)
-    monkeypatch.setattr(candidates, "MAX_SHARED_PLACES", len(found.view) // 3)
-    some = estimate(found.shared(), np.zeros(12, np.int64)).gain
-    assert not np.array_equal(some, light.gain) and np.abs(some / light.gain - 1).max() < 0.04
+    all_of_it = len(found.shared(12).photo)
+    monkeypatch.setattr(candidates, "SIGHTS_PER_PHOTO", all_of_it // 36)
+    some = found.shared(12)
+    assert 0.2 < len(some.photo) / all_of_it < 0.4
+    assert np.abs(OneLight.of(scene.views, some).stops - light.stops).max() < 0.05
 
 
 def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch):
@@ -463,7 +472,7 @@ def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch)
 def test_gains_of_photographs_that_share_nothing_stay_one():
     found = Candidates(100)
     found.view[:50, 0], found.view[50:, 0], found.color[:] = 0, 1, 128
-    assert np.allclose(estimate(found.shared(), np.zeros(3, np.int64)).gain, 1)
+    assert not fit_light(found.shared(3), np.zeros(3, np.int64), np.zeros((3, 3, 2))).stops.any()
 
 
 def test_regions_weigh_no_more_than_asked():
