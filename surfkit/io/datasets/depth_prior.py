@@ -18,7 +18,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile, normal_path, read_record
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_layouts import EstimatedDepths
-from surfkit.io.datasets.depth_lens import fits_both, has_shape, judge, lens_in
+from surfkit.io.datasets.depth_lens import fits_both, judge, lens_in, refuse_unlike
 from surfkit.io.datasets.depth_map_index import located
 from surfkit.io.datasets.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
 from surfkit.io.datasets.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
@@ -281,7 +281,7 @@ def _fit(
         values = file.read()
         confidence, normal = file.read_confidence(), file.read_normal()
         lens, either = lens_in(view, file, values.shape, straight), fits_both(view, file, values.shape)
-        _check_map(values, view, lens)
+        refuse_unlike(values, view, lens)
         _check_beside(values, {"confidence": confidence, "normals": normal})
         trusted = 1.0 if confidence is None else float((confidence > MIN_TRUSTED_CONFIDENCE).mean())
         at, inverse, tracked = points_in(view, observations, scene, guess=file.aligned)
@@ -293,17 +293,6 @@ def _fit(
         return ScaleOffsetFit(file, 1 / scene.frame.scale, 0.0, trusted, unit, straight, lens, either)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
-
-
-def _check_map(values: np.ndarray, view: View, lens: Lens | None) -> None:
-    height, width = values.shape
-    if lens is None and not has_shape(values.shape, view.camera.width, view.camera.height):
-        raise BadInput(f"{width} x {height} px is not the shape of its photograph")
-    known = values[np.isfinite(values)]
-    if not len(known):
-        raise BadInput("no value in it")
-    if np.ptp(known) <= 1e-6 * np.abs(known).max():
-        raise BadInput("constant")
 
 
 def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -> None:
