@@ -96,7 +96,7 @@ def refuse_processes(run: Run, count: int, rasterizer: Rasterizer, caches: Cache
     if recipe.partition is not None:
         raise BadInput(
             f"--processes {count}: the recipe divides the scene into blocks, which are trained by themselves; "
-            "choose --executor executor:pool, or partition:none"
+            "choose executor:pool, or partition:none"
         )
     if recipe.refine:
         raise BadInput(f"--processes {count}: refine.0 works on the whole model in one process; add refine.0:none")
