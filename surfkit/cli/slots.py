@@ -13,6 +13,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from surfkit.cli.component_overrides import open_places, with_parts
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
+from surfkit.core.check import BadInput
 from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, kebab, unknown
 
@@ -40,13 +41,14 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
 
 
 def flags_as_choices(command: type, argv: Sequence[str]) -> list[str]:
-    """The same words, with `--SLOT NAME` and `--SLOT=NAME` rewritten to `SLOT:NAME`."""
+    """The same words, with `--SLOT NAME`, `--SLOT=NAME` and `--SLOT SLOT:NAME` rewritten to `SLOT:NAME`."""
     known, found, rest = slots(command, argv), [], list(argv)
     while rest:
         word = rest.pop(0)
         flag, equals, name = word.partition("=")
         if flag.startswith("--") and flag[2:] in known and (equals or (rest and not rest[0].startswith("-"))):
-            word = f"{flag[2:]}:{name if equals else rest.pop(0)}"
+            name = name if equals else rest.pop(0)
+            word = f"{flag[2:]}:{name.removeprefix(f'{flag[2:]}:')}"
         found.append(word)
     return found
 
@@ -56,11 +58,18 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
 
     A setting before the choice it belongs to would choose the default part. A choice without alternatives is left out:
     tyro sees no choice there.
+
+    Raises:
+        BadInput: A word chooses a part that is not there; an option with many values would take it for one of them.
     """
     known = slots(command, argv)
     done = handled(argv) if "recipe" in known else set()
     argv = [word for word in argv if word not in done]
     names = {word: known.get(word.partition(":")[0], ()) for word in argv}
+    for before, word in zip(["", *argv], argv, strict=False):
+        wrong = names[word] and ":" in word and word.partition(":")[2] not in names[word]
+        if wrong and not before.startswith("--") and not Path(word).exists():
+            raise BadInput(explain_choice(command, word, argv) or word)
     choices = [word for word in argv if word.partition(":")[2] in names[word]]
     others = [word for word in argv if word.partition(":")[2] not in names[word]]
     choices.sort(key=lambda word: (not word.startswith(WHOLE_PREFIXES), word.partition(":")[0].count(".")))

@@ -215,7 +215,7 @@ def find(base: type[C], name: str) -> type[C]:
     known = components(base)
     if name in known:
         return known[name]
-    raise BadInput(unknown(base.__name__, name, known))
+    raise BadInput(f"{unknown(base.__name__, name, known)}; or install the plugin that offers it")
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:

@@ -20,6 +20,8 @@ from surfkit.scene.scene import View
 
 MIN_FITTING_SHARE = 0.8
 """Share of the trusted pixels beside a hole that what fills it must fit."""
+SEEN_THROUGH = "other views see through what would fill them"
+"""Why pixels are left empty that a fill has filled."""
 FREE_SPACE_MARGIN = 0.01
 """What lies nearer to another camera than trusted depth there, by this share of it, lies in space that is free."""
 
@@ -35,6 +37,7 @@ class FillInput:
         inverse: (h, w) float32 inverse camera z, 1/local units, where stereo is trusted; 0 elsewhere.
         trust: (h, w) float32 in [0, 1], the confidence there; 0 elsewhere.
         others: Cameras and trusted inverse depths, 0 elsewhere, of views that show the same.
+        tell: Takes why pixels are left empty, in a few words, and how many; users see the shares of all maps.
     """
 
     at: int
@@ -43,6 +46,7 @@ class FillInput:
     inverse: Tensor
     trust: Tensor
     others: Sequence[tuple[Camera, Tensor]] = ()
+    tell: Callable[[str, int], None] = lambda why, pixels: None
 
     @cached_property
     def holes(self) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput, few, require_within
+from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator, DepthInput
@@ -20,7 +21,8 @@ from surfkit.depth.depth_anything import DepthAnythingV2
 from surfkit.depth.fill_base import MIN_FITTING_SHARE, Fill, FillInput
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
-from surfkit.io.datasets.depth_lens import lens_in
+from surfkit.io.datasets.depth_lens import lens_in, refuse_unlike
+from surfkit.io.datasets.depth_prior import list_reasons
 from surfkit.io.datasets.depth_sampling import resized, straightened
 from surfkit.scene.scene import View
 
@@ -28,6 +30,8 @@ MIN_SUPPORTS = 20
 """Fewer trusted pixels tell neither scale nor shift."""
 MIN_BLENDED_SHARE = 0.5
 """Share of the weights of the patches around a pixel that patches must have which fit."""
+MIN_RAISED_SHARE = 0.1
+"""Values of a map that has some below 0 are raised to this share of their range."""
 ABSOLUTE_PASSES, CAUCHY_PASSES = 15, 5
 """Passes of iteratively reweighted least squares: for the least absolute error, then for that of Cauchy."""
 CAUCHY_SCALE = 2.385 * 1.4826
@@ -85,9 +89,19 @@ class MonocularFill(Fill):
         return tuple(file.path for file in self.found(views).values()) if self.maps else self.network.files(views)
 
     def found(self, views: Sequence[View]) -> dict[str, DepthFile]:
-        """The maps in the folder, by name of the photograph."""
+        """The maps in the folder, by name of the photograph.
+
+        Raises:
+            BadInput: There are none.
+        """
         self.refuse_missing()
-        return find_maps(DepthQuery(Path(self.maps), [view.name for view in views], Path(self.maps)))
+        files = find_maps(DepthQuery(Path(self.maps), [view.name for view in views], Path(self.maps)))
+        if views and not files:
+            raise BadInput(
+                f"fill.maps is {self.maps}, which has no depth map of these photographs; name the folder of a data "
+                f"set, or one with estimated_depths/{views[0].name}.npy"
+            )
+        return files
 
     def opened(self, given: DepthInput, wanted: Sequence[int]) -> Callable[[FillInput], Tensor]:
         """See `Fill.opened`."""
@@ -104,29 +118,19 @@ class MonocularFill(Fill):
 
     def from_files(self, given: DepthInput, wanted: Sequence[int]) -> Callable[[int], Tensor | None]:
         """(h, w) values of the view at a position, 0 where there are none, from its file; None without one."""
-        files = self.found([given.views[at] for at in wanted])
-        without = [given.views[at].name for at in wanted if given.views[at].name not in files]
-        if not files:
+        views = [given.views[at] for at in wanted]
+        files = self.found(given.views)
+        with ThreadPoolExecutor(4) as pool:
+            read = pool.map(lambda view: fault_in(view, files.get(view.name)), views)
+            faults = {view.name: fault for view, fault in zip(views, read, strict=True) if fault}
+        if faults and len(faults) == len(views):
             raise BadInput(
-                f"{self.maps} has no depth map of these photographs; name the folder of a data set, or one with "
-                f"estimated_depths/{without[0]}.npy"
+                f"fill.maps is {self.maps}, of which no map can be used: {list_reasons(faults)}; give maps of inverse "
+                "depth of these photographs"
             )
-        if without:
-            emit(Warned(f"fill.maps has no depth map of {few(without)}: nothing is filled there"))
-
-        def read(at: int) -> Tensor | None:
-            view = given.views[at]
-            file = files.get(view.name)
-            if file is None:
-                return None
-            try:
-                values = torch.from_numpy(file.read()).nan_to_num(0, 0, 0).clamp_min(0)
-            except BadInput as error:
-                raise BadInput(f"{file.path}: {error}") from error
-            lens = lens_in(view, file, values.shape, straight=False)
-            return values if lens is None else straightened(values, lens)
-
-        return read
+        if faults:
+            emit(Warned(f"fill.maps: {len(faults)} of {len(views)} photographs are not filled: {list_reasons(faults)}"))
+        return lambda at: None if (view := given.views[at]).name in faults else read_map(view, files[view.name])
 
     def from_network(self, given: DepthInput, wanted: Sequence[int]) -> Callable[[int], Tensor | None]:
         """The same from the network, which is asked for all views at once."""
@@ -155,7 +159,9 @@ class MonocularFill(Fill):
                 columns, column_weight = tent(x * step, step, width)
                 part = (rows, columns)
                 found = self.fitted(values[part], inverse[part], trust[part])
-                if found is not None:
+                if isinstance(found, str):
+                    hole.tell(found, int((inverse[part] <= 0).sum()))
+                else:
                     weight = row_weight[:, None] * column_weight * (found > 0)
                     total[part] += weight
                     mean[part] += weight * found
@@ -165,8 +171,8 @@ class MonocularFill(Fill):
             keep = (total >= MIN_BLENDED_SHARE) & (spread <= self.tolerance * mean)
         return np.where(keep, mean, 0).astype(np.float32)
 
-    def fitted(self, values: np.ndarray, inverse: np.ndarray, trust: np.ndarray) -> np.ndarray | None:
-        """(h, w) inverse depth of a patch, 0 where it goes beyond what the patch tells; None if it tells nothing.
+    def fitted(self, values: np.ndarray, inverse: np.ndarray, trust: np.ndarray) -> np.ndarray | str:
+        """(h, w) inverse depth of a patch, 0 where it goes beyond what the patch tells; why, if it tells nothing.
 
         Args:
             values: (h, w) monocular values; 0 where there are none.
@@ -175,16 +181,44 @@ class MonocularFill(Fill):
         """
         known = (inverse > 0) & (values > 0)
         if known.sum() < max(MIN_SUPPORTS, self.support * known.size):
-            return None
+            return f"stereo trusts too little around them, less than {self.support:.0%} of a patch"
         c = inverse[known].astype(np.float64)
         scale, shift = robust_line(values[known].astype(np.float64), c, trust[known].astype(np.float64))
         aligned = scale * values.astype(np.float64) + shift
         fits = np.abs(aligned[known] - c) <= self.tolerance * c
-        if scale <= 0 or np.average(fits, weights=trust[known]) < MIN_FITTING_SHARE:
-            return None
+        if scale == 0 or np.average(fits, weights=trust[known]) < MIN_FITTING_SHARE:
+            return f"the maps do not fit trusted stereo there to {self.tolerance:.1%}"
+        if scale < 0:
+            return "nearer pixels have lower values in the maps there, as in maps of depth: give maps of inverse depth"
         low, high = aligned[known][fits].min(), aligned[known][fits].max()
         reached = (aligned >= low * (1 - self.tolerance)) & (aligned <= high * (1 + self.tolerance))
         return np.where((values > 0) & reached & (aligned > 0), aligned, 0)
+
+
+def fault_in(view: View, file: DepthFile | None) -> str:
+    """Why the map of a view cannot be used; empty if it can."""
+    if file is None:
+        return "no map"
+    try:
+        values = file.read()
+        refuse_unlike(values, view, lens_in(view, file, values.shape, straight=False))
+    except BadInput as error:
+        return str(error).removeprefix(f"{file.path}: ")
+    return ""
+
+
+def read_map(view: View, file: DepthFile) -> Tensor:
+    """(h, w) values of a map, undistorted with its photograph, above 0; 0 where there are none."""
+    try:
+        values = torch.from_numpy(file.read())
+    except BadInput as error:
+        raise BadInput(f"{file.path}: {error}") from error
+    known = values.isfinite()
+    if known.any() and (low := values[known].min()) <= 0:  # they have any shift
+        values = values - low + MIN_RAISED_SHARE * (values[known].max() - low)
+    values = torch.where(known, values, 0)
+    lens = lens_in(view, file, values.shape, straight=False)
+    return values if lens is None else straightened(values, lens)
 
 
 def tent(middle: float, reach: float, size: int) -> tuple[slice, np.ndarray]:

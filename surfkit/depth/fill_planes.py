@@ -14,7 +14,7 @@ from torch import Tensor
 
 from surfkit.core.check import require_within
 from surfkit.depth.base import DepthInput
-from surfkit.depth.fill_base import MIN_FITTING_SHARE, Fill, FillInput
+from surfkit.depth.fill_base import MIN_FITTING_SHARE, SEEN_THROUGH, Fill, FillInput
 
 DRAWS = 64
 """Planes through three pixels of a rim that are tried (RANSAC, Fischler and Bolles 1981)."""
@@ -66,7 +66,10 @@ class PlaneFill(Fill):
         draw, found = np.random.default_rng(0), np.zeros(holes.shape, np.float32)
         owner, count = np.zeros(holes.shape, np.int64), 0
         boxes = find_objects(pieces)
-        for at in 1 + np.flatnonzero(np.bincount(pieces.ravel())[1:] >= MIN_HOLE_PIXELS):
+        sizes = np.bincount(pieces.ravel())[1:]
+        small = int(sizes[sizes < MIN_HOLE_PIXELS].sum())
+        given.tell(f"holes of one colour have less than {MIN_HOLE_PIXELS} pixels", small)
+        for at in 1 + np.flatnonzero(sizes >= MIN_HOLE_PIXELS):
             box = boxes[at - 1]
             rows, columns = (slice(max(0, side.start - self.rim), side.stop + self.rim) for side in box)
             hole = pieces[rows, columns] == at
@@ -74,8 +77,11 @@ class PlaneFill(Fill):
             for part, values in self.fitted(hole, alike, inverse[rows, columns], draw):
                 count += 1
                 found[rows, columns][part], owner[rows, columns][part] = values, count
+        left = int(sizes.sum() - small - (owner > 0).sum())
+        given.tell(f"trusted pixels beside them lie on no plane to {self.tolerance:.2%}, or too far away", left)
         free = np.bincount(owner[given.is_free(torch.from_numpy(found)).numpy()], minlength=count + 1)
         stays = free <= MAX_FREE_SHARE * np.bincount(owner.ravel(), minlength=count + 1)
+        given.tell(SEEN_THROUGH, int((~stays[owner] & (owner > 0)).sum()))
         return torch.from_numpy(np.where(stays[owner], found, 0))
 
     def fitted(

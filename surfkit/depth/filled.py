@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.registry import choice, name_of
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.depth.fill_base import Fill, FillInput
+from surfkit.depth.fill_base import SEEN_THROUGH, Fill, FillInput
 from surfkit.depth.fill_planes import PlaneFill
 from surfkit.depth.neighbours import MAX_CANDIDATE_VIEWS, neighbours
 from surfkit.depth.patch_match import PatchMatch
@@ -30,7 +31,9 @@ from surfkit.scene.vectors import unit
 
 MAX_CACHED_MAPS = 64
 """Maps of stereo that are kept in memory."""
-FILL_VERSION = 1
+MIN_TOLD_SHARE = 0.05
+"""Share of the pixels left empty from which on a reason is told."""
+FILL_VERSION = 2
 """Raised when the same settings fill otherwise."""
 
 
@@ -113,6 +116,7 @@ class Filled(DepthEstimator):
         return "; ".join(filter(None, (self.stereo.notice(), self.fill.notice()))) or None
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
+        fill = self.fill.opened(given, wanted)  # before hours of stereo: it may refuse
         near = neighbours(given.views, given.observations, self.neighbours, PatchMatch.angle)
         needed = sorted({*wanted, *(other for at in wanted for other in near[at])})
         missing = [at for at in needed if not stereo_path(given, at).exists()]
@@ -128,7 +132,11 @@ class Filled(DepthEstimator):
             sure = (found.inverse > 0) & (found.confidence >= self.sure)
             return given.views[at].camera.resized(width, height), torch.where(sure, found.inverse, 0)
 
-        fill, pixels, filled, empty = self.fill.opened(given, wanted), 0, 0, 0
+        pixels, filled, empty, reasons = 0, 0, 0, Counter[str]()
+
+        def tell(why: str, count: int) -> None:
+            reasons[why] += count
+
         for at in wanted:
             found, own = load_estimate(stereo_path(given, at), at), trusted(at)
             if own is None or found.inverse is None or found.confidence is None:
@@ -142,9 +150,11 @@ class Filled(DepthEstimator):
                 yield found
                 continue
             others = [other for other in map(trusted, near[at]) if other is not None]
-            hole = FillInput(at, photo, camera, inverse, torch.where(inverse > 0, found.confidence, 0), others)
+            hole = FillInput(at, photo, camera, inverse, torch.where(inverse > 0, found.confidence, 0), others, tell)
             values = torch.where(hole.holes, fill(hole), 0)
-            values = torch.where(hole.is_free(values), 0, values)
+            free = hole.is_free(values)
+            tell(SEEN_THROUGH, int(free.sum()))
+            values = torch.where(free, 0, values)
             there = values > 0
             pixels, filled = pixels + there.numel(), filled + int(there.sum())
             empty += int((hole.holes & ~there).sum())
@@ -156,7 +166,15 @@ class Filled(DepthEstimator):
                 normal,
             )
         if pixels:
-            emit(Warned(f"fill: {filled / pixels:.0%} of the pixels filled, {empty / pixels:.0%} left empty"))
+            why = shares_of(reasons)
+            emit(Warned(f"fill: {filled / pixels:.0%} of the pixels filled, {empty / pixels:.0%} left empty{why}"))
+
+
+def shares_of(reasons: Counter[str]) -> str:
+    """Why pixels are left empty, the most frequent reasons first; nothing if nobody told."""
+    total = reasons.total()
+    told = [f"{why} ({count / total:.0%})" for why, count in reasons.most_common() if count >= MIN_TOLD_SHARE * total]
+    return f", because {'; '.join(told)}" if total else ""
 
 
 def stereo_path(given: DepthInput, at: int) -> Path:

@@ -161,7 +161,9 @@ class DepthPreparation:
 
     def is_begun(self) -> bool:
         """Whether there is something to lose: maps, of these photographs or of others, or work on some."""
-        return any((self.place / DEPTH_FOLDER).rglob("*.npy")) or any(self.work.rglob("*"))
+        return any((self.place / DEPTH_FOLDER).rglob("*.npy")) or any(
+            path.is_file() and path.name != MADE_FROM_KEY for path in self.work.rglob("*")
+        )
 
     def is_outdated(self, given: DepthInput) -> bool:
         """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -96,7 +97,7 @@ def refuse_processes(run: Run, count: int, rasterizer: Rasterizer, caches: Cache
     if recipe.partition is not None:
         raise BadInput(
             f"--processes {count}: the recipe divides the scene into blocks, which are trained by themselves; "
-            "choose --executor executor:pool, or partition:none"
+            "choose executor:pool, or partition:none"
         )
     if recipe.refine:
         raise BadInput(f"--processes {count}: refine.0 works on the whole model in one process; add refine.0:none")
@@ -229,17 +230,18 @@ class Forward:
         self.said.put(("event", event))
 
 
-def _end_orphaned() -> None:
+def _end_orphaned(folder: str) -> None:
     """End this process when the one that started it is gone: the next run in the folder must have it alone."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "it was started by another"
     parent.join()
+    shutil.rmtree(folder, ignore_errors=True)  # it was left to that one
     os._exit(1)
 
 
 def _process(rank: int, work: Work, said: Any) -> None:
     """The life of one of the processes."""
-    threading.Thread(target=_end_orphaned, daemon=True).start()
+    threading.Thread(target=_end_orphaned, args=(work.folder,), daemon=True).start()
     torch.set_num_threads(work.threads)
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")

@@ -54,3 +54,10 @@ def align(values: np.ndarray, inverse: np.ndarray) -> tuple[float, float]:
         raise BadInput("constant")
     scale = s_c / s_m
     return float(scale), float(t_c - scale * t_m)
+
+
+def rank_correlation(values: np.ndarray, inverse: np.ndarray) -> float:
+    """Spearman's, -1 to 1, of values (K,) of a map, NaN where it has none, with the inverse depths (K,) of points."""
+    known = np.isfinite(values)
+    ranks = [part[known].argsort(kind="stable").argsort() for part in (values, inverse)]
+    return float(np.corrcoef(*ranks)[0, 1])

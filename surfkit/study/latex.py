@@ -8,6 +8,7 @@ from typing import Any
 
 from surfkit.study.metric_columns import TABLE_COLUMNS
 from surfkit.study.table_text import (
+    CPU_LEGEND,
     FormattedNumber,
     blanks,
     caption,
@@ -87,11 +88,25 @@ def latex(report: Mapping[str, Any]) -> str:
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{adjustbox}",
+            rf"\par\smallskip {{\footnotesize {escape(legend(report, names))}}}",
             *(rf"\par\smallskip {{\footnotesize {DAGGER} {escape(text)}.}}" for text in blanks(report)),
             r"\end{table}",
             "",
         ]
     )
+
+
+def legend(report: Mapping[str, Any], names: Sequence[str]) -> str:
+    """How the table is read, as far as it needs to be said: bold and grey, deviations, CPU minutes."""
+    rows = [row for entry in data_sets(report) for row in entry["rows"]]
+    told = ["Bold is the best number of its part of the table."]
+    if any(row["given_up"] for row in rows):
+        told += ["Grey rows were tried and not kept."]
+    if any(spread is not None for row in rows for spread in row["sd"].values()):
+        told += ["Numbers are means over the seeds ± standard deviation."]
+    if "cpu_seconds" in names:
+        told += [CPU_LEGEND]
+    return " ".join(told)
 
 
 def _heads(groups: Sequence[tuple[str, Sequence[str]]]) -> list[str]:

@@ -56,6 +56,9 @@ def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, f
     needed |= set() if "points" in known and known["points"] is None else {"points"}
     wanted = [name for name in TABLE_COLUMNS if name in needed or known.get(name) is not None]
     found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
+    for name, value in found.items():
+        if not math.isfinite(value):
+            raise BadInput(f"{name} is {value}, not a finite number")
     made = load(float, metrics.get("prepare_cpu_seconds") or 0.0, "prepare_cpu_seconds")
     return found | {"cpu_seconds": found["cpu_seconds"] + made}
 

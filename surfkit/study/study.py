@@ -15,6 +15,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, write_json, write_text
+from surfkit.core.events import say
 from surfkit.core.lock import locked
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
@@ -160,6 +161,11 @@ def ablate(
     if left:
         refuse_unusable(plan)
         refuse_other_data(plan)
+    else:
+        try:
+            refuse_other_data(plan)
+        except BadInput as error:
+            say(f"note: nothing is left to run, and the finished rows are shown as they are: {error}")
     with locked(plan.out):
         if before is not None:
             before(plan, left)
@@ -167,12 +173,7 @@ def ablate(
 
 
 class Session:
-    """The runs of a plan, as they come to their ends.
-
-    Args:
-        plan: What to run.
-        watch: Is told how it goes.
-    """
+    """The runs of a plan, as they come to their ends; `watch` is told how it goes."""
 
     def __init__(self, plan: AblationPlan, watch: AblationWatcher) -> None:
         self.plan, self.watch = plan, watch
@@ -288,8 +289,7 @@ def fingerprint(recipe: Recipe, data: Data, code: Mapping[str, str]) -> str:
     """Twelve hex digits that two runs share if they are made from the same.
 
     Args:
-        recipe: What was done.
-        data: What it was done with.
+        recipe, data: What was done, and with what.
         code: Versions of the packages that did it: surfkit, and the plugins whose parts are in the recipe.
     """
     since = {name for name, usual in ADDED_SETTINGS.items() if getattr(data, name) == usual}

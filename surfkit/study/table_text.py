@@ -17,11 +17,12 @@ from surfkit.study.ablation_warnings import row_numbers
 from surfkit.study.metric_columns import TABLE_COLUMNS, shown_columns
 from surfkit.study.shared_stages import sharing_lines
 
+CPU_LEGEND = "CPU minutes are of all processors, with the depth maps that were made for the run, and without its mesh."
 LEGEND = (
     "Numbers are means over the seeds ± standard deviation, with the difference to the row whose number is in column "
     "'on'; ± of a difference is the standard error over pairs of runs with the same seed. Rows in brackets were tried "
-    "and not kept. CPU minutes are of all processors, with the depth maps that were made for the run, and without its "
-    "mesh. Where the recipe compresses the model, quality, size and FPS are those of the compressed model."
+    f"and not kept. {CPU_LEGEND} Where the recipe compresses the model, quality, size and FPS are those of the "
+    "compressed model."
 )
 STACKED = "Below each number are the difference and, dimmed, what was published with its difference."
 
@@ -208,7 +209,8 @@ def markdown(report: Mapping[str, Any]) -> str:
         body += [["", f"*{data['group']}*", *[""] * (len(head) - 2)]] * bool(data["group"]) + [row]
     table = ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in body]
     told = [f"- {text}" for text in (*failures(report), *blanks(report), *note_lines(report), *sharing_lines(report))]
-    page = [f"# table:{report['table']}", caption(report), "\n".join(table), LEGEND, "\n".join(told)]
+    legend = f"{LEGEND} Bold is the best number of its part of the table."
+    page = [f"# table:{report['table']}", caption(report), "\n".join(table), legend, "\n".join(told)]
     return "\n\n".join(part for part in page if part) + "\n"
 
 

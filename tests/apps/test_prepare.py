@@ -214,6 +214,17 @@ def test_masks_change_nothing(farm):
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and maps(farm) == first
 
 
+def test_an_estimate_that_was_refused_keeps_nobody_from_another(farm, tmp_path, capsys):
+    wrong = tmp_path / "wrong" / "estimated_depths"
+    wrong.mkdir(parents=True)
+    for index in range(8):
+        np.save(wrong / f"view_{index:03}.png.npy", np.full((48, 64), 3.0))
+    fill = ("estimator:filled", "estimator.fill:monocular", "--estimator.fill.maps", str(wrong.parent))
+    assert main(["prepare", "depth", str(farm), "--test-every", "4", *fill]) == 2
+    assert "no map can be used: constant" in capsys.readouterr().err
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and len(maps(farm)) == 12
+
+
 def test_a_record_without_maps_keeps_nobody_from_making_some(farm):
     """What is left where `--again` was killed after it had deleted the maps."""
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0

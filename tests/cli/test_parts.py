@@ -5,6 +5,7 @@ from itertools import zip_longest
 import pytest
 
 from surfkit.appearance.base import Appearance
+from surfkit.apps.ablate import AblateCommand
 from surfkit.apps.train import TrainCommand
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
@@ -127,3 +128,14 @@ def at(made, path):
         else:
             made = made[int(step)] if step.isdecimal() else getattr(made, step)
     return made
+
+
+def test_a_choice_that_is_not_there_is_no_value_of_the_option_before_it(tmp_path):
+    with pytest.raises(BadInput, match="no executor named 'polo'; did you mean 'pool'"):
+        parse(AblateCommand, ["--data", str(tmp_path), "executor:polo"], "surfkit ablate")
+
+
+@pytest.mark.parametrize("words", [["executor:pool"], ["--executor", "pool"], ["--executor", "executor:pool"]])
+def test_every_way_to_write_a_choice(words, tmp_path):
+    words = ["--data", str(tmp_path), *words, "--executor.workers", "3"]
+    assert parse(AblateCommand, words, "surfkit ablate").executor.workers == 3

@@ -28,9 +28,12 @@ def test_lookup_by_kind(world):
 
 
 def test_unknown_names(world):
-    with pytest.raises(BadInput, match="^no Grow .*'adaptiv'; .*'adaptive'. known: adaptive, relocate$"):
+    with pytest.raises(
+        BadInput,
+        match="^no Grow .*'adaptiv'; .*'adaptive'. known: adaptive, relocate; or install the plugin",
+    ):
         find(world.Grow, "adaptiv")
-    with pytest.raises(BadInput, match="^no Empty named 'x'; known: none$"):
+    with pytest.raises(BadInput, match="^no Empty named 'x'; known: none; or install"):
         find(world.Empty, "x")
 
     @dataclass(frozen=True)

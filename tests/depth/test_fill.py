@@ -1,5 +1,6 @@
 """Holes of depth maps against exact planes, and what must not be filled."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from surfkit.depth import DepthAnythingV2, Filled, MonocularFill, PatchMatch, Pl
 from surfkit.depth.base import Estimate
 from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.depth.fill_monocular import robust_line
-from surfkit.depth.filled import load_estimate, save_estimate
+from surfkit.depth.filled import load_estimate, save_estimate, shares_of
 from surfkit.depth.prepare_depth_maps import made_from
 from surfkit.scene.camera import Camera
 from surfkit.testing import check_depth_estimator, check_fill
@@ -267,7 +268,84 @@ def test_bad_settings_are_one_line(make, said):
         make()
 
 
-def test_a_folder_without_maps_is_told(survey, tmp_path):
-    given, _ = survey
-    with pytest.raises(BadInput, match="has no depth map of these photographs"):
-        MonocularFill(maps=str(tmp_path)).opened(given, range(9))
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (None, "has no depth map of these photographs"),
+        (lambda values: np.full_like(values, 3), "no map can be used: constant: "),
+        (lambda values: values * np.nan, "no map can be used: no value in it: "),
+        (lambda values: values[:, :40], "no map can be used: 40 x 54 px is not the shape of its photograph: "),
+        (lambda values: np.stack([values] * 3, -1), r"no map can be used: has shape \(54, 72, 3\)"),
+    ],
+)
+def test_maps_that_cannot_be_used_are_refused_before_stereo(survey, tmp_path, wrong, said):
+    given, truth = survey
+    folder = write_maps(tmp_path, given, truth)
+    for path in (folder / "estimated_depths").iterdir():
+        path.unlink() if wrong is None else np.save(path, wrong(np.load(path)))
+    filled = Filled(stereo=PlaneSweep(longest=72), fill=MonocularFill(maps=str(folder)))
+    with pytest.raises(BadInput, match=said):
+        next(filled.estimate(replace(given, work=tmp_path / "work"), range(9)))
+    assert not (tmp_path / "work").exists()
+
+
+def test_some_maps_that_cannot_be_used_are_named_and_the_others_fill(survey, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("surfkit.depth.fill_monocular.emit", told.append)
+    given, truth = survey
+    folder = write_maps(tmp_path, given, truth)
+    first, second, *_ = (folder / "estimated_depths" / f"{view.name}.npy" for view in given.views)
+    first.unlink()
+    np.save(second, np.load(second)[:-20])
+    read = MonocularFill(maps=str(folder)).from_files(given, range(9))
+    assert read(0) is None and read(1) is None and all((read(at) > 0).any() for at in range(2, 9))
+    names = [view.name for view in given.views]
+    assert "2 of 9 photographs are not filled" in told[0].text
+    assert f"no map: {names[0]}; 72 x 34 px is not the shape of its photograph: {names[1]}" in told[0].text
+
+
+def test_values_below_zero_are_raised_as_they_have_any_shift(survey, tmp_path):
+    given, truth = survey
+    folder = write_maps(tmp_path, given, truth)
+    path = folder / "estimated_depths" / f"{given.views[0].name}.npy"
+    before = np.load(path)
+    np.save(path, before - before.mean())
+    found = MonocularFill(maps=str(folder)).from_files(given, range(9))(0).numpy()
+    assert (found[np.isfinite(before)] > 0).all() and np.ptp((found - before)[np.isfinite(before)]) < 1e-6
+
+
+STEEP = plane((0.6, -0.9, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "where", "said"),
+    [
+        (1 / STEEP, disc(10.0), "as in maps of depth: give maps of inverse depth"),
+        (
+            torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0)),
+            disc(10.0),
+            "do not fit trusted stereo",
+        ),
+        (monocular(STEEP), STEEP > 0, "stereo trusts too little around them"),
+    ],
+)
+def test_why_nothing_is_filled_is_told(values, where, said):
+    told = []
+    given = replace(hole(STEEP, where), tell=lambda why, pixels: told.append((pixels, why)))
+    filled_by(values, given)
+    assert said in max(told)[1]
+
+
+def test_why_planes_fill_nothing_is_told_for_each_pixel():
+    draw, told = np.random.default_rng(0), []
+    rough = torch.from_numpy(draw.uniform(0.9, 1.1, (HEIGHT, WIDTH))).float() * plane()
+    given = hole(rough, disc() | ((ROWS < 3) & (COLUMNS < 3)))
+    PlaneFill().planes(replace(given, tell=lambda why, pixels: told.append((why, pixels))))
+    assert [pixels for why, pixels in told if "lie on no plane" in why] == [int(disc().sum())]
+    assert sum(pixels for _, pixels in told) == int(given.holes.sum())
+
+
+def test_reasons_are_told_with_their_shares():
+    assert shares_of(Counter()) == ""
+    found = shares_of(Counter({"few": 4, "much": 66, "some": 30}))
+    assert found == ", because much (66%); some (30%)"

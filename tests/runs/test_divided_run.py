@@ -124,7 +124,8 @@ def test_the_processes_end_with_the_one_that_has_started_them(data, tmp_path):
         "--checkpoint-every",
         "1",
     ]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as started:
+    given = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": {**os.environ, "TMPDIR": str(tmp_path)}}
+    with subprocess.Popen(command, **given) as started:
         try:
             for _ in range(600):
                 workers = started_by(started.pid)
@@ -136,6 +137,7 @@ def test_the_processes_end_with_the_one_that_has_started_them(data, tmp_path):
     assert len(workers) == 2
     for _ in range(200):
         if not any(map(is_running, workers)):
+            assert not list(tmp_path.glob("surfkit-processes-*")), "where they have found each other"
             return
         time.sleep(0.1)
     for number in workers:

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 
 from surfkit.core.check import BadInput
@@ -19,6 +21,12 @@ TABLE = Table(
 
 def run(psnr: float, points: int = 100) -> dict[str, float]:
     return {"psnr": psnr, "ssim": 0.5, "points": points, "seconds": 60.0, "cpu_seconds": 90.0}
+
+
+def test_what_is_no_finite_number_is_refused():
+    metrics = {"images": {"psnr": math.nan, "ssim": 0.5}, "seconds": 1.0, "cpu_seconds": 1.0, "points": 3}
+    with pytest.raises(BadInput, match="psnr is nan, not a finite number"):
+        figures(metrics)
 
 
 def test_a_paired_difference_by_hand():

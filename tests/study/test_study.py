@@ -198,7 +198,7 @@ def test_a_finished_table_needs_nothing(data, runs, tmp_path):
     assert len(runs.calls) == 2, "other steps are other runs"
 
 
-def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_path):
+def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_path, capsys):
     """Photographs were replaced after some rows were finished: the others would be trained on what is there now."""
     write_colmap(tmp_path / "scene", photograph(Flight(views=9, width=24, height=18, points=40)))
     plan = AblationPlan(TABLE, (Data(tmp_path / "scene"),), tmp_path / "out")
@@ -213,6 +213,7 @@ def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_p
     with pytest.raises(BadInput, match=rf"--out {plan.out} .*photograph {photo.name}"):
         ablate(replace(plan, seeds=2), Silent())
     assert runs.calls == [] and rows_in(ablate(plan, Silent()))[0]["runs"] == rows_in(first)[0]["runs"]
+    assert f"shown as they are: --out {plan.out} has rows" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_row_that_draws_nothing_is_done_without_lpips(data, tmp_path):

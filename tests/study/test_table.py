@@ -151,6 +151,8 @@ def test_latex_has_best_numbers_bold_and_given_up_rows_grey():
     assert "\n\\rowcolor{gray!20} + aside & 25.50" in tex and "\\rowcolor{gray!20} other" not in tex
     assert "\\textit{First\\_part}" in tex and "50\\% \\& more" in tex and "\\label{tab:looks}" in tex
     assert "PSNR$\\uparrow$ & points$\\downarrow$" in tex
+    told = "Grey rows were tried and not kept. Numbers are means over the seeds $\\pm$ standard deviation."
+    assert f"{{\\footnotesize Bold is the best number of its part of the table. {told}}}\n\\end{{table}}" in tex
     assert escape(r"a_b \ {x} ~ ^ <2 × 3>") == (
         r"a\_b \textbackslash{} \{x\} \textasciitilde{} \textasciicircum{} \textless{}2 $\times$ 3\textgreater{}"
     )

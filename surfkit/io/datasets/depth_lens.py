@@ -80,6 +80,18 @@ def has_shape(shape: Sequence[int], width: int, height: int) -> bool:
     return abs(shape[0] - wanted) <= 1 + 0.01 * wanted
 
 
+def refuse_unlike(values: np.ndarray, view: View, lens: Lens | None) -> None:
+    """BadInput, in a few words, if (h, w) values are not a depth map of a photograph; `lens` is what distorts it."""
+    height, width = values.shape
+    if lens is None and not has_shape(values.shape, view.camera.width, view.camera.height):
+        raise BadInput(f"{width} x {height} px is not the shape of its photograph")
+    known = values[np.isfinite(values)]
+    if not len(known):
+        raise BadInput("no value in it")
+    if np.ptp(known) <= 1e-6 * np.abs(known).max():
+        raise BadInput("constant")
+
+
 def fits_both(view: View, file: DepthFile, shape: Sequence[int]) -> bool:
     """Whether the shape of a map (height, width) does not tell of which photograph it is."""
     return lens_in(view, file, shape, straight=False) is not None and lens_in(view, file, shape, straight=True) is None

@@ -18,13 +18,13 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile, normal_path, read_record
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
 from surfkit.io.datasets.depth_layouts import EstimatedDepths
-from surfkit.io.datasets.depth_lens import fits_both, has_shape, judge, lens_in
+from surfkit.io.datasets.depth_lens import fits_both, judge, lens_in, refuse_unlike
 from surfkit.io.datasets.depth_map_index import located
 from surfkit.io.datasets.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
 from surfkit.io.datasets.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
 from surfkit.io.datasets.panoramas import has_panoramas, points_remedy
 from surfkit.io.datasets.read import model_folder, observations
-from surfkit.scene.align import MAX_ERROR_PX, SCALE_BAND, align, sample
+from surfkit.scene.align import MAX_ERROR_PX, SCALE_BAND, align, rank_correlation, sample
 from surfkit.scene.cache import Cache
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import Lens, Scene, View
@@ -38,6 +38,10 @@ LISTED_PHOTOS = 10
 """Photographs that a warning names."""
 SWITCHED_OFF = "everything that learns from them is switched off, such as the losses depth and normal-prior"
 """Consequence of missing depth priors."""
+CONTRARY_ORDER = 0.5
+"""A map is taken for one of depth if its rank correlation with the sparse points is below minus this."""
+MIN_ORDER = 0.3
+"""Median rank correlation of the maps below which they may be of other photographs."""
 MIN_KNOWN_CONFIDENCE = 0.1
 """Least confidence of a pixel of which a depth prior knows something."""
 
@@ -86,7 +90,7 @@ class ScaleOffsetFit:
 
     `trusted` is the share of its pixels with high confidence, 1 where that is not known; `unit` is what tells its unit,
     if it has one. `straight` is as for `DepthAlignment`, `lens` what distorts it, if anything does, and `either`
-    whether its shape does not tell.
+    whether its shape does not tell. `order` is the rank correlation with the sparse points that it is fitted to.
     """
 
     file: DepthFile
@@ -97,6 +101,7 @@ class ScaleOffsetFit:
     straight: bool = False
     lens: Lens | None = None
     either: bool = False
+    order: float | None = None
 
 
 def prior_cache(
@@ -231,6 +236,8 @@ def alignment(
         emit(Warned(text))
     if text := far_warning([fit.unit for fit in used], scene):
         emit(Warned(text))
+    if text := order_warning([fit.order for fit in used if fit.order is not None]):
+        emit(Warned(text))
     if text := trust_warning(float(np.mean([fit.trusted for fit in used]))):
         emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
@@ -245,6 +252,14 @@ def trust_warning(share: float) -> str | None:
         return None
     causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
     return f"only {share:.1%} of the pixels of the depth maps are trusted; see whether the photographs {causes}"
+
+
+def order_warning(orders: Sequence[float]) -> str | None:
+    """A warning where maps hardly have the order of the sparse points, from the rank correlation of each."""
+    if not orders or (median := float(np.median(orders))) >= MIN_ORDER:
+        return None
+    found = f"the depth maps hardly follow the sparse points: rank correlation {median:.2f}, median of {len(orders)}"
+    return f"{found}; see whether they belong to these photographs"
 
 
 def typical_inverse_depth(views: Sequence[View], observations: Observations, scene: Scene) -> float:
@@ -281,29 +296,21 @@ def _fit(
         values = file.read()
         confidence, normal = file.read_confidence(), file.read_normal()
         lens, either = lens_in(view, file, values.shape, straight), fits_both(view, file, values.shape)
-        _check_map(values, view, lens)
+        refuse_unlike(values, view, lens)
         _check_beside(values, {"confidence": confidence, "normals": normal})
         trusted = 1.0 if confidence is None else float((confidence > MIN_TRUSTED_CONFIDENCE).mean())
         at, inverse, tracked = points_in(view, observations, scene, guess=file.aligned)
         at = at if lens is None else distorted(at, lens)
         if not file.aligned:
-            scale, offset = align(sample(values, at), inverse)
-            return ScaleOffsetFit(file, scale, offset, trusted, None, straight, lens, either)
+            scale, offset = align(found := sample(values, at), inverse)
+            order = rank_correlation(found, inverse)
+            if order < -CONTRARY_ORDER:
+                return "nearer points have lower values in it, as in a map of depth; give maps of inverse depth"
+            return ScaleOffsetFit(file, scale, offset, trusted, None, straight, lens, either, order)
         unit = unit_of(values / scene.frame.scale, at, inverse, tracked)
         return ScaleOffsetFit(file, 1 / scene.frame.scale, 0.0, trusted, unit, straight, lens, either)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
-
-
-def _check_map(values: np.ndarray, view: View, lens: Lens | None) -> None:
-    height, width = values.shape
-    if lens is None and not has_shape(values.shape, view.camera.width, view.camera.height):
-        raise BadInput(f"{width} x {height} px is not the shape of its photograph")
-    known = values[np.isfinite(values)]
-    if not len(known):
-        raise BadInput("no value in it")
-    if np.ptp(known) <= 1e-6 * np.abs(known).max():
-        raise BadInput("constant")
 
 
 def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -> None:

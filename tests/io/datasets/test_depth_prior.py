@@ -238,6 +238,19 @@ def test_what_cannot_be_used_is_listed_once(farm):
     )
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda values: 1 / np.where(values > 0, values, 1e9), "as in a map of depth"),
+        (lambda values: np.random.default_rng(0).uniform(1, 2, values.shape), "hardly follow the sparse points"),
+    ],
+)
+def test_maps_of_depth_or_of_other_photographs_are_told(farm, wrong, said):
+    data, scene, exact = farm
+    relative(data, {name: wrong(values) for name, values in exact.items()})
+    assert [note for note in priors_of(data, scene)[1] if said in note]
+
+
 def test_a_scale_far_from_the_others_is_a_failure(farm):
     data, scene, exact = farm
     relative(data, exact)

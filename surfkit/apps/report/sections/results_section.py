@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from surfkit.apps.report.elements import Section, TableCell, TableElement
-from surfkit.apps.report.json_values import QUANTITIES, number, numeric, of_metrics, plain, value_at
+from surfkit.apps.report.elements import Prose, Section, TableCell, TableElement
+from surfkit.apps.report.json_values import QUANTITIES, in_words, mapping, number, numeric, of_metrics, plain, value_at
 from surfkit.apps.report.run_files import RunFiles
 
+DEPTH_DATA = ("priors", "depth_layout", "depth_of")
+"""Settings of the data set that say nothing of its photographs."""
 SEAM_PARTS = {"near": "near block borders", "elsewhere": "away from block borders"}
 
 
@@ -25,7 +28,22 @@ def results(runs: Sequence[RunFiles]) -> Section:
     ]
     caption = f"Figures of the runs, with the differences to {runs[0].name}"
     head = ("run", *(QUANTITIES[name].label for name in names))
-    return Section("results", "Results", (TableElement(caption, head, tuple(rows), is_sortable=True),))
+    table = TableElement(caption, head, tuple(rows), is_sortable=True)
+    return Section("results", "Results", (*_of_other_data(runs), table))
+
+
+def _of_other_data(runs: Sequence[RunFiles]) -> tuple[Prose, ...]:
+    """A warning where runs were not trained and measured on the same photographs, of the same size."""
+    data = [{name: it for name, it in mapping(run.record, "data").items() if name not in DEPTH_DATA} for run in runs]
+    names = [name for name in dict.fromkeys(name for one in data for name in one) if len(_values(data, name)) > 1]
+    if not names:
+        return ()
+    which = ", ".join(f"data.{name}" for name in names)
+    return (Prose(f"The runs have other photographs, or read them otherwise: {which}. Their figures do not compare."),)
+
+
+def _values(data: Sequence[dict[str, Any]], name: str) -> set[str]:
+    return {in_words(one.get(name)) for one in data}
 
 
 def figures(run: RunFiles) -> dict[str, float]:
