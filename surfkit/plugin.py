@@ -68,6 +68,7 @@ from surfkit.io.splats.file_axes import FileAxes
 from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.frequency import Frequency
 from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
@@ -186,6 +187,7 @@ __all__ = [
     "Flat3D",
     "Format",
     "Frame",
+    "Frequency",
     "Gaussian3D",
     "Gradients",
     "Ground",
