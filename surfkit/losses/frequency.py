@@ -37,10 +37,10 @@ class Frequency(Loss):
     of 8 bits, in either picture, have no phase here. A radius is in cycles per pixel, the same in all directions.
     """
 
-    low: float = 0.05
+    low: float = 1.0
     """Weight of the low band (w_l)."""
 
-    high: float = 0.05
+    high: float = 1.0
     """Weight of the high band (w_h)."""
 
     radius: float = 0.1
