@@ -9,7 +9,7 @@ from surfkit_compgs.codes import CodedAdam
 from surfkit_compgs.opacity import OpacitySum
 
 COMPGS = Recipe(
-    about="3DGS, fewer and fewer points, trained as codes of k-means from step 20,000 on (CompGS, Navaneet et al. 2024)",
+    about="3DGS with ever fewer points, trained as codes of k-means from step 20,000 on (CompGS, Navaneet et al. 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(
         regularizers={"opacity": OpacitySum()},

@@ -58,7 +58,9 @@ def some_points() -> Points:
     draw = torch.Generator().manual_seed(0)
     cloud = SparsePoints(torch.rand(COUNT, 3, generator=draw), torch.randint(256, (COUNT, 3), generator=draw).byte())
     params = Gaussian3D(sh_degree=1).init(cloud, draw)
-    return Points.fresh({name: value + 0.1 * torch.randn(value.shape, generator=draw) for name, value in params.items()})
+    return Points.fresh(
+        {name: value + 0.1 * torch.randn(value.shape, generator=draw) for name, value in params.items()}
+    )
 
 
 def taken(optimizer: Optimizer, points: Points, first: int, last: int) -> None:

@@ -14,8 +14,8 @@ from surfkit.plugin import SIGMOID, Adam, BadInput, Columns, OptimizerInput, Poi
 MASK, SCORE = "lp3dgs/mask", "lp3dgs/score"
 """Columns (N,): m, and the importance S; 0 of points that have none. The pruner writes them first."""
 DRAWN, MISSING = "lp3dgs/drawn", "lp3dgs/missing"
-"""Columns (N,): the factor gs of the opacity that a point is drawn with, 0 where it is drawn as it is; and what its logit
-lacks of that without a mask."""
+"""Columns (N,): the factor gs of the opacity that a point is drawn with, 0 where it is drawn as it is; and what its
+logit lacks of that without a mask."""
 FIRST, SECOND, AGE = "lp3dgs/first", "lp3dgs/second", "lp3dgs/age"
 """Columns (N,): the moments of m, and the steps that it has learned."""
 LEAST_MASK, LEAST_FACTOR = 1e-3, 1e-6

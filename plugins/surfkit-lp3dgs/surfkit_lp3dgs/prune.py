@@ -14,7 +14,7 @@ from surfkit.plugin import BadInput, Edit, Points, Primitive, Prune, Step, StepC
 from surfkit_lp3dgs.mask import DRAWN, MASK, SCORE
 
 SHARP = 16
-"""Power of the sum that stands for a maximum over the pixels of a view: of n pixels it is at most n^(1/16) times that."""
+"""Power of the sum that stands for a maximum over the pixels of a view: of n pixels it is at most n^(1/16) times it."""
 HIDDEN = 0.1
 """Factor of the mask below which a point keeps the importance that it had: what is hidden shows none."""
 LEAST_SCORE = 1e-6
@@ -26,13 +26,13 @@ class PruneByMask(Prune):
     """Prune once, by a mask that is learned: how many points go is learned too (LP-3DGS, Zhang et al. NeurIPS 2024).
 
     For stages with `optimizer:masked-adam`, which learns the masks (sections 3.3 and 4.1 of the paper). Meanwhile this
-    measures every `every` steps how important each point is to the training views, and at the end it drops the points whose mask is off: gs(m S) < 1/2 without noise, which is m S < 1. With the mask learned by
-    step 20,000 of 30,000, the rest of the run lets the others adapt.
+    measures every `every` steps how important each point is to the training views, and at the end it drops the points
+    whose mask is off: gs(m S) < 1/2 without noise, which is m S < 1. The rest of the run lets the others adapt.
 
-    Not in the paper: where m begins, and what counts as a mask of 0. m S stands in a logarithm, so its size matters, and
-    sums over pixels have a size that depends on the photographs: here S is the importance over the median of all points
-    that a view shows. What a mask has dimmed shows less, so importance is divided by the factor that a point was drawn
-    with; below a factor of 0.1 a point keeps the one it had.
+    Not in the paper: where m begins, and what counts as a mask of 0. The size of m S matters, as it stands in a
+    logarithm, and sums over pixels have a size that depends on the photographs: here S is the importance over the
+    median of all points that a view shows. What a mask has dimmed shows less, so importance is divided by the factor
+    that a point was drawn with; below a factor of 0.1 a point keeps the one it had.
     """
 
     start: Steps = 19_500

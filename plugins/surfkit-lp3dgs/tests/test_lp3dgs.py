@@ -74,8 +74,8 @@ def told(index: int, seed: int, rates: dict[str, float]) -> OptimizerInput:
 
 
 def test_gradients_by_opacity_and_mask_are_those_of_the_drawn_opacity(monkeypatch):
-    """The optimizer is given the gradient of a loss by the logit of what was drawn; what it hands on must be that of the
-    same loss by the logit without the mask, and by m, in float64."""
+    """The optimizer is given the gradient of a loss by the logit of what was drawn; what it hands on must be that of
+    the same loss by the logit without the mask, and by m, in float64."""
     draw = torch.Generator().manual_seed(0)
     logits, mask, score = (torch.rand(9, generator=draw, dtype=torch.float64) + shift for shift in (-0.5, 0.3, 0.2))
     score[8] = 0  # a point without importance is drawn as it is
