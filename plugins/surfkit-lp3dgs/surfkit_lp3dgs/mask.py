@@ -52,7 +52,7 @@ class MaskedAdam(Adam):
     drawn. Meanwhile the points hold the masked opacities, so that all that looks at them sees what is drawn; what is
     missing is kept beside them, and comes back when the learning ends. In all other steps this is `adam`.
 
-    The learning rate of m is not in the paper; the default lets m fall from `begin` to 0 in 150 steps.
+    The learning rate of m is not in the paper; at the default m can fall from 1 to 0 in 100 steps, or rise to 6 in 500.
     """
 
     tau: float = 0.5
@@ -61,7 +61,7 @@ class MaskedAdam(Adam):
     sparsity: float = 5e-4
     """Weight of the mean of |m| in the loss (lambda_m)."""
 
-    rate: float = 0.02
+    rate: float = 0.01
     """Learning rate of m."""
 
     def __post_init__(self) -> None:

@@ -49,8 +49,8 @@ class PruneByMask(Prune):
     """Importance: the largest alpha T of a point in any pixel of any view (RadSplat); or the sum of alpha T over all
     pixels and views (Mini-Splatting). The largest of a view is the sum of the 16th powers, to the power of 1/16."""
 
-    begin: float = 3.0
-    """Where masks m begin: nine tenths of the opacity are drawn, in the middle, of a point of median importance."""
+    begin: float = 1.0
+    """Where masks m begin: at 1, half of the opacity of a point of median importance is drawn, in the middle."""
 
     def __post_init__(self) -> None:
         for name, least in (("start", 1), ("length", 1), ("every", 1)):
