@@ -21,6 +21,10 @@ LEAST_SCORE = 1e-6
 """Importance of a point that no view shows, as a multiple of the median: points with one are told by it."""
 
 
+STRETCH = 20
+"""Short runs learn for up to so many times the share of a long run: 500 of 30,000 steps become a third."""
+
+
 @dataclass(frozen=True)
 class PruneByMask(Prune):
     """Prune once, by a mask that is learned: how many points go is learned too (LP-3DGS, Zhang et al. NeurIPS 2024).
@@ -38,11 +42,11 @@ class PruneByMask(Prune):
     start: Steps = 19_500
     """Last step before the masks are learned."""
 
-    length: Annotated[int, StepCount(floor=100)] = 500
-    """Steps that they are learned for; short runs keep at least 100, in which m must find its value. The last of them
-    prunes."""
+    length: Annotated[int, StepCount(floor=100, stretch=STRETCH)] = 500
+    """Steps that they are learned for; the last of them prunes. Short runs keep at least 100, in which m must find its
+    value, but no more than a third of the run."""
 
-    every: Annotated[int, StepCount(floor=20)] = 20
+    every: Annotated[int, StepCount(floor=20, stretch=STRETCH)] = 20
     """Steps between measurements of importance, each as many drawings as there are training views."""
 
     score: Literal["peak", "sum"] = "peak"

@@ -205,6 +205,8 @@ def test_the_recipe_has_both_parts_and_its_row_and_scales_with_the_steps():
     short = rescale(recipe, 400 / 30_000).pretrain
     refuse_unfit_stage("pretrain", short, recipe.primitive)
     assert (short.prune[0].start, short.prune[0].length) == (260, 100)
+    for steps in (2, 20, 60, 100):
+        refuse_unfit_stage("pretrain", rescale(recipe, steps / 30_000).pretrain, recipe.primitive)
 
 
 def test_what_does_not_fit_is_refused(monkeypatch):
