@@ -10,11 +10,13 @@ from surfkit.appearance.exposure import Exposure
 from surfkit.apps.sfm.base import FeatureExtractor, FeatureMatcher, Features, Find, MatchInput
 from surfkit.compress.base import Compressor, Plan
 from surfkit.compress.encoding import ColumnType, Encoding
+from surfkit.compress.kmeans import kmeans, nearest
 from surfkit.compress.levels.base import LevelsOfDetail, LodInput
 from surfkit.compress.levels.hierarchy import Hierarchy
 from surfkit.compress.levels.lod_tree import LodBlock, LodBlocks, LodTree
 from surfkit.compress.octree import Leaf
 from surfkit.compress.streams import Stored
+from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput, Fault, expect, leaving_out, reject, require_within
 from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import (
@@ -51,6 +53,7 @@ from surfkit.densify.base import (
 )
 from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
+from surfkit.densify.prune import PruneByOpacity
 from surfkit.densify.signal import AbsGradient
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.fill_base import Fill, FillInput
@@ -68,6 +71,7 @@ from surfkit.io.splats.file_axes import FileAxes
 from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.frequency import Frequency
 from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
@@ -118,7 +122,7 @@ from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.study.ablation import Row, Table
 from surfkit.study.recipes import SURFELS
 from surfkit.train import checkpoint
-from surfkit.train.adam import AdamInView
+from surfkit.train.adam import Adam, AdamInView
 from surfkit.train.faults import Diverged
 from surfkit.train.interrupt import graceful
 from surfkit.train.optimizer import Optimizer, OptimizerInput
@@ -131,6 +135,7 @@ __all__ = [
     "ADC",
     "AbsGradient",
     "Activation",
+    "Adam",
     "AdamInView",
     "Appearance",
     "Assign",
@@ -186,6 +191,7 @@ __all__ = [
     "Flat3D",
     "Format",
     "Frame",
+    "Frequency",
     "Gaussian3D",
     "Gradients",
     "Ground",
@@ -240,6 +246,7 @@ __all__ = [
     "Primitive",
     "Progress",
     "Prune",
+    "PruneByOpacity",
     "QuantileGrid",
     "Rasterizer",
     "Reader",
@@ -286,6 +293,7 @@ __all__ = [
     "Trainer",
     "Transients",
     "Trust",
+    "Vectree",
     "View",
     "ViewStatistics",
     "Views",
@@ -308,10 +316,12 @@ __all__ = [
     "harmonics",
     "hookimpl",
     "isosurface",
+    "kmeans",
     "leaving_out",
     "load",
     "log_linear",
     "name_of",
+    "nearest",
     "normals_of",
     "oriented",
     "read_json",

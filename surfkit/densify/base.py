@@ -12,6 +12,7 @@ from torch import Tensor
 
 from surfkit.core.lazy import Lazy
 from surfkit.core.registry import Component, find
+from surfkit.primitives.base import Primitive
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Derived, Splats
@@ -216,6 +217,10 @@ class Densify(Policy):
 
 class Prune(Policy):
     """A policy that removes points."""
+
+    def refuse_unfit(self, path: str, stage: Any, primitive: Primitive) -> None:  # noqa: B027 (most fit everywhere)
+        """BadInput if the stage (`surfkit.plugin.Stage`) at a path in the recipe lacks what this works with, such as an
+        optimizer of its own; asked before a run."""
 
     def edits(self, steps: int, views: int) -> Sequence[int] | None:
         """The steps 1 to `steps` of a stage with so many views after which points may be removed by what they are

@@ -6,6 +6,7 @@ from surfkit.core.hooks import hookimpl
 from surfkit.core.registry import Component
 from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.frequency import Frequency
 from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.patch_depth import PatchDepth
 from surfkit.losses.photometric import L1, SSIM
@@ -25,6 +26,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "distortion": Distortion,
         "depth": DepthRegression,
         "patch-depth": PatchDepth,
+        "frequency": Frequency,
         "normal-prior": NormalPrior,
         "reprojection": Reprojection,
         "warped-patches": WarpedPatches,

@@ -46,6 +46,7 @@ class Target:
             to it (`ignoring`) that no loss learns from such pixels.
         neighbour: A second view, for losses that need one; None where no other photograph shows enough of the same.
         seed: Of random draws in this step, in [0, 2^63).
+        index: The step, from 1, for losses that change as the training goes on; 0 before there is one.
     """
 
     view: View
@@ -54,6 +55,7 @@ class Target:
     mask: Tensor | None = None
     neighbour: Neighbour | None = None
     seed: int = 0
+    index: int = 0
 
 
 def ignoring(maps: Maps, target: Target) -> tuple[Maps, Target]:

@@ -261,6 +261,9 @@ def refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
             f"{path}.densify: {name_of(stage.densify)} asks which points lead in a pixel, and primitive "
             f"{name_of(primitive)} does not tell; choose {path}.densify:adc, or another primitive"
         )
+    for prune in stage.prune:
+        prune.refuse_unfit(path, stage, primitive)
+    stage.optimizer.refuse_unfit(path, stage, primitive)
     if stage.appearance is not None:
         stage.appearance.refuse_unfit(primitive)
         used = {name for index in (1, (stage.steps + 1) // 2, stage.steps) for name in stage.weights_at(index)}

@@ -37,8 +37,9 @@ def next_target(setup: StageSetup, state: StageState) -> tuple[int, Target]:
         at = state.order.next(state.generator)
         if at in state.skipped or (shown := _readable(setup, state, at, setup.uploads.get(at))) is None:
             continue
-        target = Target(setup.views[at], shown.in_floats(), shown.prior, shown.mask, seed=state.seed)
-        return at, smaller(target, setup.stage.divisor_at(state.index + 1))
+        index = state.index + 1
+        target = Target(setup.views[at], shown.in_floats(), shown.prior, shown.mask, seed=state.seed, index=index)
+        return at, smaller(target, setup.stage.divisor_at(index))
     raise BadInput(f"none of the {len(setup.views)} photographs can be read, {setup.views[0].path} for one")
 
 

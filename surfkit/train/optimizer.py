@@ -5,13 +5,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.losses.base import Target
+from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps, Splats
 
@@ -58,6 +59,10 @@ class Optimizer(Component):
 
     pulls: ClassVar[bool] = False
     """Whether steps want other gradients beside that of the losses (`OptimizerInput.pull`)."""
+
+    def refuse_unfit(self, path: str, stage: Any, primitive: Primitive) -> None:  # noqa: B027 (most fit everywhere)
+        """BadInput if the stage (`surfkit.plugin.Stage`) at a path in the recipe, or the primitive, lacks what this
+        works with; asked before a run."""
 
     def moment_type(self) -> torch.dtype:
         """Of `points.exp_avg` and `points.exp_avg_sq`."""

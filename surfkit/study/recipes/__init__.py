@@ -12,6 +12,7 @@ from surfkit.densify.prune import PruneByImportance
 from surfkit.densify.signal import AbsGradient
 from surfkit.densify.trim import Trim
 from surfkit.losses.consensus import Consensus
+from surfkit.losses.frequency import Frequency
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
@@ -71,6 +72,12 @@ ABSOLUTE_GAUSSIANS = Recipe(
     about="3DGS that splits by the sizes of the pixels' gradients, which signs do not cancel (AbsGS, Ye et al. 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(signal=AbsGradient(), densify=ADC(split_threshold=4e-4, small=0.001)),
+)
+
+BY_FREQUENCY = Recipe(
+    about="3DGS that learns spectra too, low frequencies first, and splits what lacks the high ones (FreGS, 2024)",
+    primitive=Gaussian3D(),
+    pretrain=Stage(losses={"l1": L1(), "ssim": SSIM(), "frequency": Frequency()}),
 )
 
 TRIMMED = Recipe(
@@ -152,6 +159,7 @@ RECIPES = {
     "flat3dgs": FLAT_GAUSSIANS,
     "mip-splatting": MIP_GAUSSIANS,
     "absgs": ABSOLUTE_GAUSSIANS,
+    "fregs": BY_FREQUENCY,
     "trim2dgs": TRIMMED,
     "lightgaussian": LIGHT_GAUSSIANS,
     "dogs": BLOCKS_AGREE,

@@ -290,6 +290,7 @@ METHODS_TABLE = Table(
         Row("2DGS", paper=compared(0.756, 23.93, 0.232, 0.553, 0.446, 0.491)),
         Row("3DGS", recipe=RECIPES["3dgs"], kept=False),
         Row("AbsGS", recipe=RECIPES["absgs"], kept=False),
+        Row("FreGS", recipe=RECIPES["fregs"], kept=False),
         Row("Trim2DGS", recipe=RECIPES["trim2dgs"], kept=False),
         Row(
             "CityGaussian",
