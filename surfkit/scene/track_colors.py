@@ -21,7 +21,7 @@ PHASE = "comparing the light of photographs"
 DRAFT_SIDE_PX = 256
 """Longer side at which photographs are read, pixels, or up to twice that: the colour of a place is a mean around it."""
 MAX_POINTS_PER_PHOTO, MAX_SIGHTS = 300, 3_000_000
-"""On average, and of all photographs, of which a million take a GB; other points are left out, chosen at random."""
+"""On average, and of all photographs, of which a million take 1.3 GB; other points are left out, chosen at random."""
 
 
 @dataclass(frozen=True)

@@ -253,14 +253,16 @@ class _Problem:
         steep = 2 * (a + squared * (2 * b + 3 * squared * c))
         of_camera = numbers.ends[0] + OF_CAMERA * self.camera[:, None] + np.arange(OF_CAMERA)
         of_slope = np.broadcast_to(numbers.ends[1] + np.arange(3), (len(self.photo), 3))
-        width, each = len(numbers.flat), np.arange(len(self.photo))
+        width, each = len(numbers.flat), np.arange(len(self.photo), dtype=np.int32)
         normal, pull = sparse.csr_matrix((width, width)), np.zeros(width)
         weights, curve = self.weights(now, deviation), curve_terms(now.encoded)
         for channel in range(3):
             weight, light = weights[:, channel], now.light[:, channel]
             entries = [np.ones_like(squared), -squared, -(squared**2), -(squared**3), *(steep * offset.T)]
             entries += [*(term[:, channel] / now.slope[:, channel] for term in curve), *self.aside.T]
-            columns = np.concatenate([3 * self.photo[:, None] + channel, of_camera, of_slope + 3 * channel], 1)
+            columns = np.concatenate(
+                [3 * self.photo[:, None] + channel, of_camera, of_slope + 3 * channel], 1, dtype=np.int32
+            )
             matrix = sparse.csr_matrix(
                 (np.stack(entries, 1).ravel(), (np.repeat(each, columns.shape[1]), columns.ravel())), (len(each), width)
             )
