@@ -33,12 +33,12 @@ class CodedAdam(Adam):
     """Adam on points that are drawn as codes of k-means (CompGS, Navaneet et al. ECCV 2024, section 3).
 
     After step `start`, base colours, the other harmonics, scales and rotations of each point are those of the nearest
-    of a few thousand codes. The gradient by what is drawn is taken for that by the parameters without codes
-    (straight-through estimator), and Adam moves these. After each step a code becomes the mean of its points, and
-    every `every` steps, up to `until`, each point chooses its code anew, as one iteration of k-means does. Positions
-    and opacities are never quantised. The points hold the codes, which policies see, and which are measured and
-    saved; what they differ by is kept beside them, and goes with them through edits. New points choose a code at
-    once. A block of a scene has codes of its own.
+    of a few thousand codes. A straight-through estimator takes the gradient by what is drawn for that by the parameters
+    without codes, and Adam moves these. After each step a code becomes the mean of its points, and every `every` steps,
+    up to `until`, each point chooses its code anew, as one iteration of k-means does. Positions and opacities are never
+    quantised. The points hold the codes, which policies see, and which are measured and saved; what they differ by is
+    kept beside them, and goes with them through edits. New points choose a code at once. A block of a scene has codes
+    of its own.
 
     The paper has 4,096 codes for colours, and 16,384 (CompGS 16K) or 32,768 for shapes. How the first codes are
     found, and whether scales are clustered as logarithms, was not at hand: here k-means of 10 iterations finds them,
