@@ -52,7 +52,7 @@ class Consensus(Regularizer):
                 raise BadInput(f"consensus.{name} is {getattr(self, name)}; it must be more than 0")
         if self.every < 1 or self.balance_until < 0:
             raise BadInput(
-                f"consensus.every {self.every}, balance_until {self.balance_until}: give 1 or more, 0 or more"
+                f"consensus.every {self.every}, balance_until {self.balance_until}: give every >= 1, the other >= 0"
             )
         if not 0 < self.relaxation < 2:
             raise BadInput(f"consensus.relaxation is {self.relaxation}; it must lie between 0 and 2")

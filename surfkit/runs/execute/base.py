@@ -145,7 +145,7 @@ class Pool(Executor):
     def __post_init__(self) -> None:
         if self.workers < 1 or self.threads < 0 or self.gpus < 0:
             given = f"pool.workers {self.workers}, threads {self.threads}, gpus {self.gpus}"
-            raise BadInput(f"{given}: give 1 or more, 0 or more, 0 or more")
+            raise BadInput(f"{given}: give workers 1 or more, the others 0 or more")
         if not 0 < self.memory_share <= 1:
             raise BadInput(f"pool.memory_share is {self.memory_share}; it must lie in 0 to 1")
 
