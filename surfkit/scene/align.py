@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from surfkit.core.check import BadInput
 
@@ -59,5 +60,4 @@ def align(values: np.ndarray, inverse: np.ndarray) -> tuple[float, float]:
 def rank_correlation(values: np.ndarray, inverse: np.ndarray) -> float:
     """Spearman's, -1 to 1, of values (K,) of a map, NaN where it has none, with the inverse depths (K,) of points."""
     known = np.isfinite(values)
-    ranks = [part[known].argsort(kind="stable").argsort() for part in (values, inverse)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(spearmanr(values[known], inverse[known]).statistic)

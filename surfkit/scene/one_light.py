@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -53,6 +53,11 @@ class OneLight:
             taken_by=taken_by,
             cameras=found.cameras,
         )
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray]) -> OneLight:
+        """That whose attributes were kept, among other arrays, by their names."""
+        return cls(**{each.name: arrays[each.name] for each in fields(cls)})
 
     def even(self, color: np.ndarray, number: int, camera: Camera, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(n, 3) sRGB colours in [0, 1] of a photograph, in one light.

@@ -9,7 +9,7 @@ more on what rises above its surroundings. Alpha expansion finds a low sum.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -266,7 +266,7 @@ def find_regions(
     kept.forget(LOOKED_FOLDER)
     label = chosen["label"].reshape(blocks.shape).astype(np.int32)
     view = chosen["view"].reshape(*blocks.shape, -1)
-    return PhotoRegions(blocks.size, label, view, OneLight(*(chosen[field.name] for field in fields(OneLight))))
+    return PhotoRegions(blocks.size, label, view, OneLight.restored(chosen))
 
 
 def flight_height(views: Sequence[View], frame: Frame, grid: MapGrid, height: np.ndarray) -> float:

@@ -14,6 +14,8 @@ from surfkit.core.files import replacing
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
 from surfkit.scene.scene import View
 
+CHOICE_VERSION = 2
+"""Raised when photographs are chosen, or brought to one light, otherwise; nothing of an interrupted call stays."""
 BATCH_ROWS = 1 << 20
 """Rows that are looked at at once."""
 Arrays = dict[str, np.ndarray]
@@ -79,8 +81,8 @@ def identity(surface: SurfaceFile) -> str:
 
 
 def seen(views: Sequence[View]) -> str:
-    """A digest of the cameras, photographs and masks of views: files by size and time."""
-    found = hashlib.sha256()
+    """A digest of the cameras, photographs and masks of views, files by size and time, and of how they are chosen."""
+    found = hashlib.sha256(f"{CHOICE_VERSION}".encode())
     for view in views:
         camera = view.camera
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -234,7 +234,7 @@ def textured(
         told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
         emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
-    used = OneLight(*(chosen[field.name] for field in fields(OneLight)))
+    used = OneLight.restored(chosen)
     levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, used)))
     return TexturedMesh(
         PaintInput(mesh, atlas, photos, used, SeamCorrections(**levels)), region, texel, chosen["outliers"].item()

@@ -9,7 +9,7 @@ from interrupted import digests, interrupted_often
 from needs import needs
 from town import town
 
-from surfkit.apps.texture import find_candidates
+from surfkit.apps.texture import find_candidates, texture_cache
 from surfkit.apps.texture import texture_export as deliver
 from surfkit.apps.texture import texture_mesh as make
 from surfkit.apps.texture.texture_cache import TextureCache
@@ -76,7 +76,7 @@ def stopped(monkeypatch, scene, out, settings):
     assert not out.exists() and (out.with_name(out.name + UNFINISHED_SUFFIX) / "chosen-0.npz").exists()
 
 
-@pytest.mark.parametrize("what", ["nothing", "setting", "mesh", "photograph", "damage"])
+@pytest.mark.parametrize("what", ["nothing", "setting", "mesh", "photograph", "another way to choose", "damage"])
 def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
     out, settings, said = tmp_path / "out", replace(SETTINGS, formats=("glb",)), []
     stopped(monkeypatch, scene, out, settings)
@@ -86,6 +86,8 @@ def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
         scene.surface.rows["z"][7] += 0.01
     elif what == "photograph":
         os.utime(scene.views[3].path, ns=(1, 1))
+    elif what == "another way to choose":
+        monkeypatch.setattr(texture_cache, "CHOICE_VERSION", texture_cache.CHOICE_VERSION + 1)
     elif what == "damage":
         file = out.with_name(out.name + UNFINISHED_SUFFIX) / "chosen-0.npz"
         file.write_bytes(file.read_bytes()[:-100])
@@ -93,7 +95,7 @@ def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
     monkeypatch.setattr("surfkit.core.stages.emit", said.append)
     made(scene, out, settings)
     assert len(looks) == (0 if what == "nothing" else len(scene.views))
-    assert len(said) == (what in ("setting", "mesh", "photograph"))
+    assert len(said) == (what not in ("nothing", "damage"))
     assert (out / TEXTURE_RECORD).exists() and not out.with_name(out.name + UNFINISHED_SUFFIX).exists()
 
 

@@ -39,7 +39,7 @@ def _of_other_data(runs: Sequence[RunFiles]) -> tuple[Prose, ...]:
     if not names:
         return ()
     which = ", ".join(f"data.{name}" for name in names)
-    return (Prose(f"The runs have other photographs, or read them otherwise: {which}. Their figures do not compare."),)
+    return (Prose(f"The runs have other photographs, or read them otherwise: {which}. Their figures may not compare."),)
 
 
 def _values(data: Sequence[dict[str, Any]], name: str) -> set[str]:
