@@ -161,7 +161,7 @@ def _wrong(count: int, wanted: Count | None, what: str) -> str | None:
     if count >= least and (most is None or count <= most):
         return None
     told = f"{least:,}" if least == most else f"{least:,} or more" if most is None else f"{least:,} to {most:,}"
-    return f"{count:,} {what}, where there must be {told}"
+    return f"{count:,} {what.removesuffix('s') if count == 1 else what}, where there must be {told}"
 
 
 def _of_photographs(protocol: Protocol, scene: BenchmarkScene, data: Data, read_scene: Scene) -> Iterator[Finding]:

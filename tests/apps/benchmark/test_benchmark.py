@@ -142,6 +142,11 @@ def test_what_is_not_as_it_should_be(root, tiny, tmp_path, capsys, monkeypatch):
     assert "20 points, where there must be 100 or more; it is the laser scan, from the page of scans" in said
     assert "6 training photographs, where there must be 7" in said
     assert not (tmp_path / "out").exists()
+    for picture in (folder / "A/images").iterdir():
+        if picture.name != "view_003.png":
+            picture.unlink()
+    assert tiny_run(folder, tmp_path / "out", "--check") == 2
+    assert "images: 1 picture, where there must be 9" in capsys.readouterr().err
 
 
 def test_small_photographs_are_noticed(root, tiny, tmp_path, capsys, monkeypatch):
