@@ -259,11 +259,24 @@ def choice(base: type[Component], optional: bool = False, without: Sequence[str]
 
     def union() -> Any:
         known = {name: cls for name, cls in components(base).items() if name not in without}
-        named = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in known.items()]
+        named = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in derived_first(known)]
         members = tuple(named + [None] * optional)
         return Union[members] if members else Annotated[base, tyro.conf.Fixed]  # noqa: UP007 (made at run time)
 
     return tyro.conf.arg(constructor_factory=union)
+
+
+def derived_first(known: Mapping[str, type]) -> list[tuple[str, type]]:
+    """Names and classes in their order, but no class before one that is derived from it.
+
+    tyro takes a default for the first member of a union that it is an instance of. If a base class came first, its name
+    would stand for a default of the derived class, and give that.
+    """
+    found: list[tuple[str, type]] = []
+    for name, cls in known.items():
+        before = next((at for at, (_, other) in enumerate(found) if issubclass(cls, other)), len(found))
+        found.insert(before, (name, cls))
+    return found
 
 
 def _installed() -> list[importlib.metadata.EntryPoint]:

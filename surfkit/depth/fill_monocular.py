@@ -36,6 +36,9 @@ ABSOLUTE_PASSES, CAUCHY_PASSES = 15, 5
 """Passes of iteratively reweighted least squares: for the least absolute error, then for that of Cauchy."""
 CAUCHY_SCALE = 2.385 * 1.4826
 """In medians of the absolute error; 95 % efficient for normal errors (Holland and Welsch 1977)."""
+BEYOND_RANGE = "their depth lies beyond that of the trusted pixels around them"
+DISAGREEING = "the patches around them do not agree"
+NO_VALUE = "the maps have no value there"
 MONOCULAR_FILL_RANGES = {"patch": (0.01, 2), "support": (1e-6, 1), "tolerance": (1e-6, 1)}
 
 
@@ -153,22 +156,28 @@ class MonocularFill(Fill):
         step = max(2.0, self.patch * max(height, width) / 2)
         inverse, trust = hole.inverse.numpy(), hole.trust.numpy()
         total, mean, square = (np.zeros(values.shape) for _ in range(3))
+        reasons = _Reasons(values.shape)
         for y in range(math.ceil((height - 1) / step) + 1):
             for x in range(math.ceil((width - 1) / step) + 1):
                 rows, row_weight = tent(y * step, step, height)
                 columns, column_weight = tent(x * step, step, width)
-                part = (rows, columns)
+                part, weight = (rows, columns), row_weight[:, None] * column_weight
                 found = self.fitted(values[part], inverse[part], trust[part])
                 if isinstance(found, str):
-                    hole.tell(found, int((inverse[part] <= 0).sum()))
+                    reasons.add(found, part, weight)
                 else:
-                    weight = row_weight[:, None] * column_weight * (found > 0)
+                    reasons.add(BEYOND_RANGE, part, weight * (found <= 0))
+                    weight = weight * (found > 0)
                     total[part] += weight
                     mean[part] += weight * found
                     square[part] += weight * found**2
         with np.errstate(divide="ignore", invalid="ignore"):
             mean, spread = mean / total, np.sqrt(np.maximum(square / total - (mean / total) ** 2, 0))
-            keep = (total >= MIN_BLENDED_SHARE) & (spread <= self.tolerance * mean)
+            many = total >= MIN_BLENDED_SHARE
+            keep = many & (spread <= self.tolerance * mean)
+        reasons.add(DISAGREEING, (slice(None), slice(None)), np.where(many & ~keep, math.inf, 0.0))
+        reasons.add(NO_VALUE, (slice(None), slice(None)), np.where(values <= 0, math.inf, 0.0))
+        reasons.tell(hole, (inverse <= 0) & ~keep)
         return np.where(keep, mean, 0).astype(np.float32)
 
     def fitted(self, values: np.ndarray, inverse: np.ndarray, trust: np.ndarray) -> np.ndarray | str:
@@ -193,6 +202,28 @@ class MonocularFill(Fill):
         low, high = aligned[known][fits].min(), aligned[known][fits].max()
         reached = (aligned >= low * (1 - self.tolerance)) & (aligned <= high * (1 + self.tolerance))
         return np.where((values > 0) & reached & (aligned > 0), aligned, 0)
+
+
+class _Reasons:
+    """Why pixels of a map (h, w) are not filled: of each pixel what weighs most."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.names: list[str] = []
+        self.weight, self.name = np.zeros(shape), np.zeros(shape, np.int64)
+
+    def add(self, why: str, part: tuple[slice, slice], weight: np.ndarray) -> None:
+        """Something that speaks against the pixels of a part with a weight above 0."""
+        if why not in self.names:
+            self.names.append(why)
+        heavier = (weight > self.weight[part]) | (weight == math.inf)
+        self.weight[part][heavier] = weight[heavier]
+        self.name[part][heavier] = self.names.index(why)
+
+    def tell(self, hole: FillInput, empty: np.ndarray) -> None:
+        """Count the reasons of the pixels that stay empty, (h, w) bool."""
+        for at, count in enumerate(np.bincount(self.name[empty], minlength=len(self.names))):
+            if count:
+                hole.tell(self.names[at], int(count))
 
 
 def fault_in(view: View, file: DepthFile | None) -> str:

@@ -166,15 +166,19 @@ class Filled(DepthEstimator):
                 normal,
             )
         if pixels:
-            why = shares_of(reasons)
+            why = shares_of(reasons, empty)
             emit(Warned(f"fill: {filled / pixels:.0%} of the pixels filled, {empty / pixels:.0%} left empty{why}"))
 
 
-def shares_of(reasons: Counter[str]) -> str:
-    """Why pixels are left empty, the most frequent reasons first; nothing if nobody told."""
-    total = reasons.total()
-    told = [f"{why} ({count / total:.0%})" for why, count in reasons.most_common() if count >= MIN_TOLD_SHARE * total]
-    return f", because {'; '.join(told)}" if total else ""
+def shares_of(reasons: Counter[str], empty: int) -> str:
+    """Why pixels are left empty, the most frequent reasons first; nothing if nobody told.
+
+    Args:
+        reasons: How many pixels each is the reason of.
+        empty: Pixels that are left empty.
+    """
+    told = [f"{why} ({count / empty:.0%})" for why, count in reasons.most_common() if count >= MIN_TOLD_SHARE * empty]
+    return f", because {'; '.join(told)}" if told and empty else ""
 
 
 def stereo_path(given: DepthInput, at: int) -> Path:

@@ -77,7 +77,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 10
+    version: ClassVar[int] = 11
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""

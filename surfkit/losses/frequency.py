@@ -59,7 +59,7 @@ class Frequency(Loss):
             raise BadInput(f"the frequency loss has start {self.start} and full {self.full}; give 0 <= start <= full")
 
     def weight_at(self, index: int, steps: int) -> float:
-        return float(max(self.low, self.high) > 0)
+        return float(self.low > 0 or (self.high > 0 and index > self.start))
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         color = maps.need("color")

@@ -9,6 +9,7 @@ from surfkit.core.registry import name_of
 from surfkit.runs.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.train.smaller import MIN_SIDE_PX
+from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 
 NONE_HELD_OUT = (
@@ -34,6 +35,29 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
                 epochs = f" of {views:,} photographs to an epoch" * (views > 1)
                 due = f"is never due within its {stage.steps:,} steps{epochs}; more steps, or another schedule of it,"
                 emit(Warned(f"{at.setting}.prune.{number}: {name_of(prune)} {due} change that"))
+
+
+def warn_of_plain_blocks(run: Run) -> None:
+    """Say what of pretraining the tuning of blocks is without, where nobody has said how they are tuned."""
+    if run.recipe.partition is None:
+        return
+    tune, plain = _parts(run.recipe.tune), _parts(Stage())
+    other = [f"tune.{path}:{name}" for path, name in _parts(run.recipe.pretrain).items() if tune.get(path) != name]
+    if tune == plain and other:
+        emit(
+            Warned(
+                f"blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add "
+                f"{' '.join(other)}, and their settings"
+            )
+        )
+
+
+def _parts(stage: Stage) -> dict[str, str]:
+    """Names of what decides how a stage learns, by their paths in it."""
+    parts = {f"losses.{key}": loss for key, loss in stage.losses.items()}
+    parts |= {f"regularizers.{key}": one for key, one in stage.regularizers.items()}
+    parts |= {"appearance": stage.appearance, "optimizer": stage.optimizer, "densify": stage.densify}
+    return {path: "none" if part is None else name_of(part) for path, part in parts.items()}
 
 
 def warn_of_sizes(run: Run, scene: Scene) -> None:

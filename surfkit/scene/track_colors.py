@@ -44,7 +44,8 @@ class TrackColors:
 def track_colors(views: Sequence[View], tracks: Observations) -> TrackColors:
     """Colours of the sparse points that two photographs and more show; a photograph that cannot be read shows none."""
     shown = [tracks.seen.get(view.name) for view in views]
-    counts = sum((np.bincount(one.points, minlength=len(tracks.xyz)) for one in shown if one is not None), start=0)
+    different = (np.unique(one.points) for one in shown if one is not None)  # a track may hold a photograph twice
+    counts = sum((np.bincount(points, minlength=len(tracks.xyz)) for points in different), start=0)
     kept = np.flatnonzero(np.asarray(counts) > 1)
     total, most = int(np.asarray(counts)[kept].sum()), min(MAX_POINTS_PER_PHOTO * len(views), MAX_SIGHTS)
     if total > most:

@@ -99,9 +99,9 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> Tr
     count, cameras = len(taken_by), int(taken_by.max(initial=-1)) + 1
     stops, values, slope = np.zeros((count, 3)), np.zeros((cameras, OF_CAMERA)), np.zeros((3, 3))
     usable = ((colors.color > DARK) & (colors.color < BRIGHT)).all(1)
-    usable &= (np.bincount(colors.point[usable], minlength=colors.point.max(initial=-1) + 1) > 1)[colors.point]
+    usable[usable] = shown_twice(colors.photo[usable], colors.point[usable])
     photo, point, place, color = (each[usable] for each in (colors.photo, colors.point, colors.place, colors.color))
-    seen = np.bincount(photo, minlength=count)
+    seen = np.bincount(np.unique(np.stack([photo, point]), axis=1)[0], minlength=count)
     if not len(photo):
         return TrackLight(stops, values, slope, seen, 0.0)
     camera, aside = taken_by[photo], (axes[photo] @ place[:, :, None])[..., 0]
@@ -120,6 +120,16 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> Tr
         if reached > (1 - LEAST_PROGRESS) * cost:
             break
     return TrackLight(numbers.stops, numbers.cameras, numbers.slope, seen, deviation)
+
+
+def shown_twice(photo: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """(K,) bool, whether the point of a sight is shown by another photograph too; tracks may hold one twice.
+
+    Args:
+        photo, point: (K,) int64 of sights.
+    """
+    points = np.unique(np.stack([photo, point]), axis=1)[1]
+    return (np.bincount(points, minlength=point.max(initial=-1) + 1) > 1)[point]
 
 
 def light_to_learn_from(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> TrackLight:

@@ -1,5 +1,6 @@
 """Parts that come, change or go by a word, on the real recipes."""
 
+from dataclasses import fields
 from itertools import zip_longest
 
 import pytest
@@ -10,7 +11,7 @@ from surfkit.apps.train import TrainCommand
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
-from surfkit.core.registry import components
+from surfkit.core.registry import Component, components, derived_first, kind_of, name_of
 from surfkit.densify import CountCap, Elongation, PruneByOpacity, Trim
 from surfkit.densify.base import Densify, Filter, Prune, Signal
 from surfkit.losses.base import Loss, Regularizer
@@ -21,6 +22,7 @@ from surfkit.losses.transients import Transients
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.base import Primitive
 from surfkit.train.optimizer import Optimizer
+from surfkit.train.stage import Stage
 
 
 def stage(*words: str):
@@ -139,3 +141,46 @@ def test_a_choice_that_is_not_there_is_no_value_of_the_option_before_it(tmp_path
 def test_every_way_to_write_a_choice(words, tmp_path):
     words = ["--data", str(tmp_path), *words, "--executor.workers", "3"]
     assert parse(AblateCommand, words, "surfkit ablate").executor.workers == 3
+
+
+def parts_of(recipe):
+    """Paths and parts of its slots, and of those of its stages."""
+    for slot in fields(recipe):
+        part = getattr(recipe, slot.name)
+        inner = (
+            {f"{slot.name}.{each.name}": getattr(part, each.name) for each in fields(part)}
+            if isinstance(part, Stage)
+            else {}
+        )
+        yield from ((path, one) for path, one in {slot.name: part, **inner}.items() if isinstance(one, Component))
+
+
+DERIVED = sorted(
+    (path, base, name)
+    for name, recipe in recipes().items()
+    for path, part in parts_of(recipe)
+    for base, cls in components(kind_of(type(part))).items()
+    if cls is not type(part) and isinstance(part, cls)
+)
+"""Slots, names of a part that theirs is derived from, and recipes."""
+
+
+@pytest.mark.parametrize(("path", "base", "name"), {each[:2]: each for each in DERIVED}.values())
+def test_a_part_is_swapped_for_the_one_that_it_is_derived_from(path, base, name):
+    """tyro takes a default for the first name whose class it is an instance of."""
+    made = parse(TrainCommand, [f"recipe:{name}", f"{path}:{base}"], "surfkit train").recipe
+    assert name_of(dict(parts_of(made))[path]) == base
+
+
+def test_derived_classes_come_before_their_bases_and_others_keep_their_order():
+    class Base: ...
+
+    class Other: ...
+
+    class Child(Base): ...
+
+    class Grandchild(Child): ...
+
+    known = {"base": Base, "other": Other, "grandchild": Grandchild, "child": Child}
+    assert [name for name, _ in derived_first(known)] == ["grandchild", "child", "base", "other"]
+    assert [name for name, _ in derived_first({"other": Other, "base": Base})] == ["other", "base"]

@@ -332,8 +332,10 @@ STEEP = plane((0.6, -0.9, 1.0))
 def test_why_nothing_is_filled_is_told(values, where, said):
     told = []
     given = replace(hole(STEEP, where), tell=lambda why, pixels: told.append((pixels, why)))
-    filled_by(values, given)
+    filled = filled_by(values, given)
     assert said in max(told)[1]
+    left = given.holes & (torch.as_tensor(filled) <= 0)
+    assert sum(pixels for pixels, _ in told) == int(left.sum()), "each pixel has one reason, that stays empty"
 
 
 def test_why_planes_fill_nothing_is_told_for_each_pixel():
@@ -346,6 +348,6 @@ def test_why_planes_fill_nothing_is_told_for_each_pixel():
 
 
 def test_reasons_are_told_with_their_shares():
-    assert shares_of(Counter()) == ""
-    found = shares_of(Counter({"few": 4, "much": 66, "some": 30}))
+    assert shares_of(Counter(), 0) == ""
+    found = shares_of(Counter({"few": 8, "much": 132, "some": 60}), 200)
     assert found == ", because much (66%); some (30%)"

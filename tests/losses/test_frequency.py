@@ -128,6 +128,8 @@ def test_it_keeps_the_contract_of_a_loss_and_its_schedule_scales():
     check_loss(Frequency())
     check_loss(Frequency(), (5, 7))
     assert Frequency().weight_at(1, 10) == 1 and Frequency(low=0, high=0).weight_at(1, 10) == 0
+    late = Frequency(low=0, start=5, full=8)
+    assert [late.weight_at(index, 10) for index in (5, 6)] == [0, 1], "no transform where nothing counts"
     short = rescale(Frequency(), 0.01)
     assert (short.start, short.full, short.radius) == (5, 150, Frequency().radius)
 

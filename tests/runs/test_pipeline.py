@@ -245,6 +245,20 @@ def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data,
     assert [text.partition(":")[0] for text in texts] == told
 
 
+def test_blocks_that_nobody_said_how_to_tune_are_told(recipe, data, tmp_path, monkeypatch):
+    texts, cut = [], QuantileGrid((1, 1))
+    monkeypatch.setattr(warn, "emit", lambda event: texts.append(event.text))
+    whole = recipes()["2dgs"]
+    for each in (whole, replace(whole, partition=cut, tune=whole.pretrain), replace(recipes()["3dgs"], partition=cut)):
+        warn.warn_of_plain_blocks(Run(tmp_path, each, data))
+    assert texts == []
+    warn.warn_of_plain_blocks(Run(tmp_path, replace(whole, partition=cut), data))
+    assert texts == [
+        "blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add "
+        "tune.losses.normal:normal tune.losses.distortion:distortion, and their settings"
+    ]
+
+
 def test_a_prune_that_is_never_due_is_told_before_the_run(recipe, data, tmp_path, monkeypatch):
     """In 1,000 steps, trims end before the first; in 9,999 with epochs of 8,000, the second epoch ends too late."""
     texts, scene = [], read(data)

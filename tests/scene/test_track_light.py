@@ -280,6 +280,18 @@ def test_light_is_uneven_from_stated_limits_on(figures, uneven):
     assert LightSpread(*figures).is_uneven == uneven
 
 
+def test_a_photograph_that_shows_a_point_twice_is_compared_with_no_other():
+    """As tracks of COLMAP do, where features were matched twice."""
+    draw = np.random.default_rng(0)
+    point, place = np.repeat(np.arange(40), 2), draw.uniform(-0.7, 0.7, (80, 2))
+    alone = TrackColors(np.zeros(80, int), point, place, draw.uniform(0.2, 0.8, (80, 3)))
+    light = fitted(alone, np.zeros(1, int))
+    assert light.seen.tolist() == [0] and not light.stops.any() and not light.cameras.any()
+    colors, _, taken_by = world()
+    twice = TrackColors(*(np.concatenate([each, each[:50]]) for each in vars(colors).values()))
+    assert np.array_equal(fitted(twice, taken_by).seen, fitted(colors, taken_by).seen)
+
+
 def test_nothing_seen_changes_nothing():
     empty = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
     light = fitted(empty, np.zeros(3, int))
@@ -309,5 +321,8 @@ def test_colours_are_read_where_the_points_are(tmp_path):
     assert np.allclose(found.color[:3, :2], at, atol=0.01) and np.allclose(found.color[:, 2], 0.4, atol=0.01)
     half = np.hypot(150, 100) / 2
     assert np.allclose(found.place[0], [(0.25 * 150 - 70) / half, (0.5 * 100 - 52) / half])
+    again = Observations2D(np.array([5, 2, 9, 2]), at[[0, 1, 2, 2]])
+    alone = track_colors(views[:1], Observations(np.zeros((12, 3)), np.zeros(12), {"a.png": again}))
+    assert not len(alone.photo), "one photograph shows no point twice"
     assert rows_of([*views, views[0]]).tolist() == [0, 1, 2, 0]
     assert Path(views[0].path).exists()

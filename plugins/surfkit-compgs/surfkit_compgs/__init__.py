@@ -16,6 +16,7 @@ COMPGS = Recipe(
         prune=(PruneByOpacity(start=15_000, until=20_000, every=1_000),),
         optimizer=CodedAdam(),
     ),
+    tune=Stage(optimizer=CodedAdam()),  # where the scene is cut
     # All colours are codes already: these codebooks are the codes themselves, in float16.
     compress=Vectree(ratio=1.0, codes=CodedAdam().colors, codebooks="by-degree"),
 )

@@ -87,7 +87,7 @@ class CodedAdam(Adam):
     @torch.no_grad()
     def step(self, points: Points, grads: Columns, given: OptimizerInput) -> None:
         """See `Optimizer.step`."""
-        coded = [name for name in SIZES if name in points.params and name in grads]
+        coded = [name for name in SIZES if name in grads and points.params[name].numel()]  # no harmonics: no codes
         for name in coded:
             if missing(name) in points.stats:
                 points.params[name].add_(points.stats[missing(name)])

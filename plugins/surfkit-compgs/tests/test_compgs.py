@@ -54,10 +54,10 @@ def test_the_parts_keep_to_the_contract_of_their_kind(part):
     check(part)
 
 
-def some_points() -> Points:
+def some_points(sh_degree: int = 1) -> Points:
     draw = torch.Generator().manual_seed(0)
     cloud = SparsePoints(torch.rand(COUNT, 3, generator=draw), torch.randint(256, (COUNT, 3), generator=draw).byte())
-    params = Gaussian3D(sh_degree=1).init(cloud, draw)
+    params = Gaussian3D(sh_degree=sh_degree).init(cloud, draw)
     return Points.fresh(
         {name: value + 0.1 * torch.randn(value.shape, generator=draw) for name, value in params.items()}
     )
@@ -104,6 +104,13 @@ def test_there_are_no_codes_before_their_time_and_no_more_than_so_many_from_then
         for name, setting in SIZES.items():
             found = np.unique(rows(points.params[name]), axis=0)
             assert 2 <= len(found) <= getattr(OPTIMIZER, setting), name
+
+
+def test_colours_of_one_degree_need_no_codes_of_others():
+    points = some_points(sh_degree=0)
+    taken(OPTIMIZER, points, 1, 6)
+    assert len(np.unique(rows(points.params["sh0"]), axis=0)) <= OPTIMIZER.colors
+    assert points.params["sh_rest"].numel() == 0
 
 
 def groups(points: Points, name: str) -> np.ndarray:

@@ -12,6 +12,7 @@ LP3DGS = Recipe(
     about="3DGS that learns which points to prune, and how many (LP-3DGS, Zhang et al. 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(prune=(PruneByMask(),), optimizer=MaskedAdam()),
+    tune=Stage(densify=None),  # where the scene is cut: what was pruned does not come back
 )
 
 

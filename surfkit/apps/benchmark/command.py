@@ -114,7 +114,8 @@ class BenchmarkCommand:
         if found := look(protocol, root, scenes, contenders):
             for finding in found:
                 say(printable(finding.text))
-            say(f"surfkit: {root}: not as {protocol.tag} has it: {len(found)}, named above; nothing was trained")
+            faults = f"{len(found)} fault{'s' * (len(found) > 1)}, listed above"
+            say(f"surfkit: {root}: not as {protocol.tag} has it: {faults}; nothing was trained")
             return FAULTY
         if self.check:
             tell(f"{root}: all that {protocol.tag} needs for {', '.join(scene.name for scene in scenes)} is there")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -70,7 +71,8 @@ def _of_scene(
     protocol: Protocol, root: Path, scene: BenchmarkScene, contenders: Sequence[Contender]
 ) -> Iterator[Finding]:
     """What one scene lacks. What rests on files that are not there is not looked at."""
-    lacking = {each.path: list(_faults(root, each)) for each in (*scene.needed, *scene.truth.needed())}
+    deeper = _one_level_deeper(root, scene)
+    lacking = {each.path: list(_faults(root, each, deeper)) for each in (*scene.needed, *scene.truth.needed())}
     for needed in (*scene.needed, *scene.truth.needed()):
         source = protocol.sources[needed.source]
         for what in lacking[needed.path]:
@@ -96,13 +98,27 @@ def _of_scene(
     yield from _of_depth(protocol, scene, contenders, data, view_source)
 
 
-def _faults(root: Path, needed: Needed) -> Iterator[str]:
-    """What is wrong with one file or folder."""
+def _one_level_deeper(root: Path, scene: BenchmarkScene) -> Path | None:
+    """The folder in the root that has most of what the root lacks, as where an archive was unpacked.
+
+    Where the files of a scene lie in no folder of its name, one that lacks some of them is another scene.
+    """
+    missing = [each.path for each in (*scene.needed, *scene.truth.needed()) if not (root / each.path).exists()]
+    found = {sub: sum(os.path.exists(sub / path) for path in missing) for sub in sorted(root.iterdir())}
+    best = max(found, key=lambda sub: found[sub], default=None)
+    least = len(missing) if scene.folder == "." else 1
+    return best if best is not None and found[best] >= max(1, least) else None
+
+
+def _faults(root: Path, needed: Needed, deeper: Path | None) -> Iterator[str]:
+    """What is wrong with one file or folder; `deeper` is where what is missing may be."""
     path = root / needed.path
     if not path.exists():
-        deeper = next(iter(sorted(root.glob(f"*/{needed.path}"))), None)
+        there = deeper is not None and os.path.exists(deeper / needed.path)
         yield (
-            "missing" if deeper is None else f"missing, but {deeper} is there: move it, or name its folder with --root"
+            f"missing, but {deeper / needed.path} is there: move it, or name {deeper} with --root"
+            if there
+            else "missing"
         )
     elif needed.pictures is not None:
         yield from _of_pictures(path, needed)

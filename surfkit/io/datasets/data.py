@@ -168,7 +168,8 @@ class Data(ReadSettings):
             chosen = set(sorted(names)[:: self.test_every]) if self.test_every else set()
             rule = f"--test-every {self.test_every}"
         if len(chosen) == len(names):
-            raise BadInput(f"{rule} holds out all {len(names)} photographs; use --test-every 0 to hold out none")
+            what = f"all {len(names)} photographs" if len(names) > 1 else "the only photograph"
+            raise BadInput(f"{rule} holds out {what}; use --test-every 0 to hold out none")
         return chosen
 
     def _by_rule(self, split: Split, capture: RawDataset) -> tuple[set[str], str]:

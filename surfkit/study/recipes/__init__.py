@@ -78,6 +78,7 @@ BY_FREQUENCY = Recipe(
     about="3DGS that learns spectra too, low frequencies first, and splits what lacks the high ones (FreGS, 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(losses={"l1": L1(), "ssim": SSIM(), "frequency": Frequency()}),
+    tune=Stage(losses={"l1": L1(), "ssim": SSIM(), "frequency": Frequency()}),
 )
 
 TRIMMED = Recipe(

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -102,7 +103,9 @@ def test_all_that_is_missing_is_told_at_once(monkeypatch, tmp_path, capsys, prot
         for needed in (*scene.needed, *scene.truth.needed()):
             (line,) = (line for line in lines if line.startswith(f"{scene.name}: data/{needed.path}: missing"))
             assert needed.what in line and protocol.sources[needed.source] in line
-    assert last == f"surfkit: data: not as {protocol.tag} has it: {len(lines)}, named above; nothing was trained"
+    assert (
+        last == f"surfkit: data: not as {protocol.tag} has it: {len(lines)} faults, listed above; nothing was trained"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
@@ -115,6 +118,15 @@ def test_data_one_level_too_deep_are_found_and_named(monkeypatch, tmp_path, caps
     said = capsys.readouterr().err
     assert "data/Barn/images: missing, but data/training/Barn/images is there: move it" in said
     assert "data/Barn/Barn.ply: missing; it is" in said
+    os.makedirs("many/another/images")
+    os.makedirs("many/another/sparse/0")
+    assert main(["benchmark", "shibuya", "--root", "many", "--check"]) == 2
+    assert "is there" not in capsys.readouterr().err, "what lies there may be another scene"
+    os.makedirs("many/right/gt/mesh.ply")
+    shutil.copytree("many/another", "many/right", dirs_exist_ok=True)
+    assert main(["benchmark", "shibuya", "--root", "many", "--check"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("move it, or name many/right with --root") == 3 and "another" not in said
     assert main(["benchmark", "tanks-and-temples", "--root", "file", "--check"]) == 2
     assert "file: a file, not a folder; name with --root" in capsys.readouterr().err
 
