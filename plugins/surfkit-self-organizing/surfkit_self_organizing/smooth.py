@@ -77,8 +77,8 @@ class SmoothGrid(Regularizer):
                 )
         if not any(self._weights().values()):
             raise BadInput(
-                f"regularizer:smooth-grid: all of {', '.join(self._weights())} are 0, so that nothing is smoothed; give "
-                f"one of them more than 0, or leave this regularizer out"
+                f"regularizer:smooth-grid: all of {', '.join(self._weights())} are 0, so that nothing is smoothed; "
+                f"give one of them more than 0, or leave this regularizer out"
             )
         for name in ("delta", "sigma"):
             if not 0 < getattr(self, name) < math.inf:
@@ -122,7 +122,12 @@ class SmoothGrid(Regularizer):
 
 
 def places_of(splats: Splats, seed: int) -> tuple[Tensor, Tensor]:
-    """(N,) int64 rows and columns of splats that are sorted, from 0."""
+    """(N,) int64 rows and columns of splats that are sorted, from 0; BadInput if these are of another kind."""
+    if splats.kind not in ("surfel", "gaussian"):
+        raise BadInput(
+            f"regularizer:smooth-grid: it smooths surfels and ellipsoids, and the primitive has splats of the kind "
+            f"{splats.kind!r}; choose another primitive, or leave this regularizer out"
+        )
     order = torch.from_numpy(grid_order(attributes_of(splats), seed)).to(splats.means.device)
     place = torch.empty_like(order)
     place[order] = torch.arange(len(order), device=order.device)
@@ -150,7 +155,9 @@ def roughness(
     """
     width = int(column.max()) + 1
     places, place = (int(row.max()) + 1) * width, row * width + column
-    values = torch.cat([*attributes.values(), torch.ones_like(row, dtype=next(iter(attributes.values())).dtype)[:, None]], 1)
+    values = torch.cat(
+        [*attributes.values(), torch.ones_like(row, dtype=next(iter(attributes.values())).dtype)[:, None]], 1
+    )
     grid = values.new_zeros(places, values.shape[1]).index_copy(0, place, values)
     blurred = blur(grid.view(-1, width, grid.shape[1]), sigma).view(places, -1).index_select(0, place)
     around = blurred[:, :-1] / blurred[:, -1:]
