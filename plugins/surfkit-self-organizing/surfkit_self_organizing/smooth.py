@@ -115,7 +115,7 @@ class SmoothGrid(Regularizer):
         weights = {name: weight for name, weight in self._weights().items() if weight > 0}
         placed = (row >= 0).nonzero()[:, 0]
         if not len(placed):
-            return splats.means.sum() * 0  # there are points of no place alone
+            return splats.means.sum() * 0  # all points came after the last sorting
         row, column = row[placed], column[placed]
         found = {name: value[placed] for name, value in attributes_of(splats).items() if name in weights}
         return roughness(found, weights, row, column, self.delta, self.sigma)

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import warnings
 import zipfile
 from dataclasses import replace
 
@@ -283,7 +284,9 @@ def test_the_name_of_a_file_chooses_the_order(tmp_path):
     assert type(format_for(tmp_path / "a.grid.sog")) is GridSOG
     GridSOG().write(tmp_path / "a.sog", some_table(20))
     assert type(format_of(tmp_path / "a.sog")) is SOG
-    GridSOG().write(tmp_path / "none.grid.sog", some_table(20).take(torch.zeros(20, dtype=torch.bool)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        GridSOG().write(tmp_path / "none.grid.sog", some_table(20).take(torch.zeros(20, dtype=torch.bool)))
     assert len(read_splat_file(tmp_path / "none.grid.sog")) == 0
 
 
