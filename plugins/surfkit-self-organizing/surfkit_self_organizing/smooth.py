@@ -36,7 +36,7 @@ class SmoothGrid(Regularizer):
     example.
     """
 
-    weight: float = 1.0
+    weight: float = 0.3
     """Loss weight of all attributes together."""
 
     positions: float = 0.0
