@@ -32,8 +32,8 @@ class SmoothGrid(Regularizer):
     it drops leave empty places; neither has a part in the loss. The mean is over points, and differences of the
     components of an attribute add up.
 
-    The paper's weights, blur and intervals were not at hand: the defaults here are those of a few runs on the bundled
-    example.
+    The paper's weights, blur and intervals were not at hand: the defaults here are ours, and the weight is one that
+    cost little on the bundled example. More of it makes smaller files, and pictures that are less sharp.
     """
 
     weight: float = 0.3
