@@ -68,6 +68,7 @@ from surfkit.io.datasets.raw_dataset import RawDataset, RawImage, Tracks, camera
 from surfkit.io.datasets.split import Split
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.file_axes import FileAxes
+from surfkit.io.splats.sog import SOG
 from surfkit.io.splats.splat_table import SplatTable, Tile
 from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.depth import DepthRegression
@@ -260,6 +261,7 @@ __all__ = [
     "Row",
     "SH_C0",
     "SIGMOID",
+    "SOG",
     "SSIM",
     "SURFELS",
     "Scene",

@@ -65,8 +65,17 @@ class SOG(Format):
         table = replace(table, means=table.file_means(frame)).on_cpu()
         self._warn(path, table)
         with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in self.files(table, morton_order(table.means.double().numpy()), frame):
+            for name, data in self.files(table, self.order(table), frame):
                 archive.writestr(zipfile.ZipInfo(name), data)
+
+    def order(self, table: SplatTable) -> np.ndarray:
+        """(N,) int64 rows of a table on the CPU, in the order that `write` stores them in; formats may have another."""
+        return morton_order(table.means.double().numpy())
+
+    @staticmethod
+    def picture_width(count: int) -> int:
+        """Pixels in a line of the images of so many splats: about a square, in steps of four."""
+        return max(4, math.ceil(math.sqrt(count) / 4) * 4)
 
     def files(self, table: SplatTable, order: np.ndarray, frame: Frame | None) -> Iterator[tuple[str, bytes]]:
         """Names and contents of the files of splats, meta.json last.
@@ -180,7 +189,7 @@ def _scale_codes(scales: np.ndarray, surfels: bool) -> np.ndarray:
 
 def _image(values: np.ndarray) -> np.ndarray:
     """(H, W, 4) pixels, a row of values in each; the last ones are left over."""
-    width = max(4, math.ceil(math.sqrt(len(values)) / 4) * 4)
+    width = SOG.picture_width(len(values))
     height = max(4, math.ceil(len(values) / width / 4) * 4)
     pixels = np.zeros((height * width, 4), np.uint8)
     pixels[:, 3] = 255
