@@ -269,8 +269,7 @@ def choice(base: type[Component], optional: bool = False, without: Sequence[str]
 def derived_first(known: Mapping[str, type]) -> list[tuple[str, type]]:
     """Names and classes in their order, but no class before one that is derived from it.
 
-    tyro takes a default for the first member of a union that it is an instance of. If a base class came first, its name
-    would stand for a default of the derived class, and give that.
+    tyro takes a default for the first class that it is an instance of: the name of a base class would give it unchanged.
     """
     found: list[tuple[str, type]] = []
     for name, cls in known.items():

@@ -61,7 +61,7 @@ from surfkit.runs.run_refinements import refine_model, stage_scene
 from surfkit.runs.run_stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.runs.stage_cache import StageCache
 from surfkit.runs.start import InitialPointBuilder, align_priors
-from surfkit.runs.warn import warn_of_gaps, warn_of_no_edits, warn_of_plain_blocks, warn_of_sizes
+from surfkit.runs.warn import warn_before
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import CacheSettings, read_ahead
@@ -118,10 +118,7 @@ def run(
         for mesher in recipe.meshers:
             mesher.refuse_unfit(scene.frame)
         refuse_unplannable(run, scene)
-        warn_of_gaps(scene, state)
-        warn_of_no_edits(run, scene)
-        warn_of_plain_blocks(run)
-        warn_of_sizes(run, scene)
+        warn_before(run, scene, state)
         if state is None:
             warn_of_light(run, scene)
         warn_of_idle(run, compute)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from surfkit.core.events import Warned, emit
-from surfkit.core.registry import name_of
+from surfkit.core.registry import Component, name_of
 from surfkit.runs.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.train.smaller import MIN_SIDE_PX
@@ -16,6 +16,14 @@ NONE_HELD_OUT = (
     "no photograph is held out (kept from training), so PSNR, SSIM and LPIPS cannot be measured; a run trained with "
     "--test-every 8 keeps every 8th to measure with"
 )
+
+
+def warn_before(run: Run, scene: Scene, state: StageState | None) -> None:
+    """Say what will not happen as one may expect, before a run begins or goes on from a state."""
+    warn_of_gaps(scene, state)
+    warn_of_no_edits(run, scene)
+    warn_of_plain_blocks(run)
+    warn_of_sizes(run, scene)
 
 
 def warn_of_no_edits(run: Run, scene: Scene) -> None:
@@ -54,7 +62,7 @@ def warn_of_plain_blocks(run: Run) -> None:
 
 def _parts(stage: Stage) -> dict[str, str]:
     """Names of what decides how a stage learns, by their paths in it."""
-    parts = {f"losses.{key}": loss for key, loss in stage.losses.items()}
+    parts: dict[str, Component | None] = {f"losses.{key}": loss for key, loss in stage.losses.items()}
     parts |= {f"regularizers.{key}": one for key, one in stage.regularizers.items()}
     parts |= {"appearance": stage.appearance, "optimizer": stage.optimizer, "densify": stage.densify}
     return {path: "none" if part is None else name_of(part) for path, part in parts.items()}

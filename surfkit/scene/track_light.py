@@ -98,8 +98,8 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> Tr
     """
     count, cameras = len(taken_by), int(taken_by.max(initial=-1)) + 1
     stops, values, slope = np.zeros((count, 3)), np.zeros((cameras, OF_CAMERA)), np.zeros((3, 3))
-    usable = ((colors.color > DARK) & (colors.color < BRIGHT)).all(1)
-    usable[usable] = shown_twice(colors.photo[usable], colors.point[usable])
+    usable = np.flatnonzero(((colors.color > DARK) & (colors.color < BRIGHT)).all(1))
+    usable = usable[shown_twice(colors.photo[usable], colors.point[usable])]
     photo, point, place, color = (each[usable] for each in (colors.photo, colors.point, colors.place, colors.color))
     seen = np.bincount(np.unique(np.stack([photo, point]), axis=1)[0], minlength=count)
     if not len(photo):

@@ -114,12 +114,10 @@ def _faults(root: Path, needed: Needed, deeper: Path | None) -> Iterator[str]:
     """What is wrong with one file or folder; `deeper` is where what is missing may be."""
     path = root / needed.path
     if not path.exists():
-        there = deeper is not None and os.path.exists(deeper / needed.path)
-        yield (
-            f"missing, but {deeper / needed.path} is there: move it, or name {deeper} with --root"
-            if there
-            else "missing"
-        )
+        if deeper is None or not os.path.exists(deeper / needed.path):
+            yield "missing"
+        else:
+            yield f"missing, but {deeper / needed.path} is there: move it, or name {deeper} with --root"
     elif needed.pictures is not None:
         yield from _of_pictures(path, needed)
     elif needed.points is not None or needed.faces is not None:
