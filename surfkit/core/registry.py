@@ -269,7 +269,7 @@ def choice(base: type[Component], optional: bool = False, without: Sequence[str]
 def derived_first(known: Mapping[str, type]) -> list[tuple[str, type]]:
     """Names and classes in their order, but no class before one that is derived from it.
 
-    tyro takes a default for the first class that it is an instance of: the name of a base class would give it unchanged.
+    tyro takes a default for the first class that it is an instance of: by the name of a base class, it would stay.
     """
     found: list[tuple[str, type]] = []
     for name, cls in known.items():
