@@ -15,6 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.fit import fit
 from surfkit.core.registry import find
 from surfkit.io.splats.base import Format
+from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.splat_files import format_for, read_splat_file
 from surfkit.io.splats.splat_table import SplatTable
 from surfkit.raster.api import Maps, Render, Splats
@@ -23,17 +24,23 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
 
 
-def read_splats(path: str | Path) -> SplatTable:
+def read_splats(path: str | Path, axes: AxesOrAuto = "auto") -> SplatTable:
     """The splats of a file of surfkit or of another program (.ply, .spz, .sog, .splat, .glb, .usdz), N of them.
 
     They are raw values, as files have them: `means` (N, 3) frame of the input, `quats` (N, 4) w x y z of any length,
     `log_scales` (N, 2) of surfels or (N, 3), `opacity_logits` (N,), `sh0` (N, 3), `sh_rest` (N, K - 1, 3).
 
+    Args:
+        path: File.
+        axes: Where its x, y and z lead, such as "rdf" (right, down, forward, as in PLY files); "auto" for what the file
+            says, or else a guess that a note tells.
+
     Raises:
-        BadInput: No such file, of no known format, or damaged.
+        BadInput: No such file, of no known format, or damaged; or no such axes.
     """
     with heard():
-        return read_splat_file(fit(Path, path, "read_splats"))
+        file = fit(Path, path, "read_splats")
+        return read_splat_file(file, fit(AxesOrAuto, axes, "read_splats: axes"), 'axes="rdf"')
 
 
 def save_splats(

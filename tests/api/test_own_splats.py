@@ -30,6 +30,18 @@ def test_edited_splats_are_written_and_read_again(run, tmp_path, suffix):
     assert again.means.mean(0).tolist() == pytest.approx(above.means.mean(0).tolist(), abs=0.05)
 
 
+def test_axes_that_a_file_does_not_say_are_told_and_set(run, tmp_path, capsys):
+    file = surfkit.save_splats(run.splats, tmp_path / "red.spz")
+    capsys.readouterr()
+    guessed = surfkit.read_splats(file)
+    assert 'is assumed; axes="rdf" takes them as those of a PLY file' in capsys.readouterr().err
+    turned = surfkit.read_splats(file, axes="rdf")
+    assert not capsys.readouterr().err
+    assert torch.allclose(turned.means, guessed.means * torch.tensor([1.0, -1.0, -1.0]))
+    with pytest.raises(surfkit.BadInput, match="read_splats: axes"):
+        surfkit.read_splats(file, axes="north")
+
+
 def test_splats_are_drawn_as_the_run_draws_them(run):
     scene, camera = run.dataset, run.dataset.held_out[0]
     ours, theirs = scene.draw(run.splats, camera), run.render(camera)

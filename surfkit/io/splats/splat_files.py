@@ -15,13 +15,14 @@ from surfkit.io.splats.rotate_splats import turned
 from surfkit.io.splats.splat_table import SplatTable
 
 
-def read_splat_file(path: Path, axes: AxesOrAuto = "auto") -> SplatTable:
+def read_splat_file(path: Path, axes: AxesOrAuto = "auto", flag: str = "--axes rdf") -> SplatTable:
     """The splats of a file of any format, which its content tells, or its name where the content does not.
 
     Args:
         path: Of the file.
         axes: Of the numbers in it. For auto, those that the file names or its format has; where it is a guess, a
             warning says so.
+        flag: What sets `axes` to those of a PLY file.
 
     Raises:
         BadInput: No such file, of no known format, or damaged.
@@ -30,7 +31,7 @@ def read_splat_file(path: Path, axes: AxesOrAuto = "auto") -> SplatTable:
     if axes != "auto":
         return from_axes(table, axes)
     if not table.axes.is_told and len(table):
-        emit(Warned(f"{untold_axes(path)}: {assumed_axes(table)}; --axes rdf takes them as those of a PLY file"))
+        emit(Warned(f"{untold_axes(path)}: {assumed_axes(table)}; {flag} takes them as those of a PLY file"))
     return table
 
 
