@@ -12,6 +12,7 @@ SELF_ORGANIZING = Recipe(
     about="3DGS whose points are alike where they are neighbours in a grid (Self-Organizing Gaussians, 2024)",
     primitive=Gaussian3D(),
     pretrain=Stage(regularizers={"smooth": SmoothGrid()}),
+    tune=Stage(regularizers={"smooth": SmoothGrid()}),  # where the scene is cut
 )
 
 
