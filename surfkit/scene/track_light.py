@@ -101,7 +101,7 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> Tr
     usable = np.flatnonzero(((colors.color > DARK) & (colors.color < BRIGHT)).all(1))
     usable = usable[shown_twice(colors.photo[usable], colors.point[usable])]
     photo, point, place, color = (each[usable] for each in (colors.photo, colors.point, colors.place, colors.color))
-    seen = np.bincount(np.unique(np.stack([photo, point]), axis=1)[0], minlength=count)
+    seen = np.bincount(different(photo, point)[0], minlength=count)
     if not len(photo):
         return TrackLight(stops, values, slope, seen, 0.0)
     camera, aside = taken_by[photo], (axes[photo] @ place[:, :, None])[..., 0]
@@ -123,13 +123,17 @@ def fit_light(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> Tr
 
 
 def shown_twice(photo: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """(K,) bool, whether the point of a sight is shown by another photograph too; tracks may hold one twice.
+    """(K,) bool, whether the point of a sight is shown by another photograph too.
 
     Args:
         photo, point: (K,) int64 of sights.
     """
-    points = np.unique(np.stack([photo, point]), axis=1)[1]
-    return (np.bincount(points, minlength=point.max(initial=-1) + 1) > 1)[point]
+    return (np.bincount(different(photo, point)[1]) > 1)[point]
+
+
+def different(photo: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Photographs and points (K,) of sights, each pair once; tracks may hold a photograph twice."""
+    return np.divmod(np.unique(photo * (most := point.max(initial=0) + 1) + point), most)
 
 
 def light_to_learn_from(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> TrackLight:
