@@ -1,9 +1,8 @@
 """How well exposures are found where every photograph has a bright side: `python bench/bright_side.py --data SCENE`.
 
 Ground is brighter where it is seen with the sun behind the camera. Colours of sparse points are given such a slope,
-and exposures of a known spread, and the fit finds the exposures again: with the slope, as textures have it (`now`); as
-training, stereo and doctor have it, who look for a slope only where exposures drift (`learned`); and as it was without
-one and with nothing that holds exposures near 0 (`before`). Two sets of points: those of a scene whose photographs have
+and exposures of a known spread, and `fit_light` finds the exposures again: with the slope, and as it was without one
+and with nothing that holds exposures near 0 (`before`). Two sets of points: those of a scene whose photographs have
 one light, such as the synthetic Shibuya, and made-up flights over flat ground of (lines, photographs in a line), of
 which three quarters of a picture overlap along a line and half across. Errors are stops, the largest less the least
 over all photographs for a flight, and the root mean square for the scene.
@@ -22,7 +21,7 @@ from surfkit.io.datasets.read import observations, read
 from surfkit.scene import track_light
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.scene.track_colors import TrackColors, axes_of, rows_of, sensor_axes, track_colors
-from surfkit.scene.track_light import fit_light, light_to_learn_from
+from surfkit.scene.track_light import fit_light
 
 FLIGHTS = ((1, 10), (1, 20), (1, 60), (1, 160), (6, 20))
 SIZE, STEP = np.array([1.2, 0.9]), np.array([0.3, 0.45])
@@ -72,7 +71,6 @@ def lit(colors: TrackColors, axes: np.ndarray, slope: np.ndarray, stops: np.ndar
 def errors(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray, stops: np.ndarray) -> dict[str, np.ndarray]:
     """(V,) what is found less the truth, the mean of the three colours, without a mean."""
     found, held = {"now": fit_light(colors, taken_by, axes).stops}, track_light.HELD
-    found["learned"] = light_to_learn_from(colors, taken_by, axes).stops
     track_light.HELD = 0.0
     found["before"] = fit_light(colors, taken_by, 0 * axes).stops
     track_light.HELD = held

@@ -12,7 +12,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.response import CENTRE, CURVE, falloff, mean_falloff, sensor_scale, uncurved
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.scene.track_colors import axes_of, rows_of, track_colors
-from surfkit.scene.track_light import MIN_SEEN, light_to_learn_from
+from surfkit.scene.track_light import MIN_SEEN, fit_light
 
 WHITE_SHARE, MOST_STRETCH = 0.005, 4.0
 """Grey values of a photograph are stretched so that so large a share of them is white, by this factor at most: noise of
@@ -31,8 +31,7 @@ class EvenLight:
         if given.in_one_light or given.observations.is_empty:
             return
         self.rows = rows_of(given.views)
-        colors = track_colors(given.views, given.observations)
-        found = light_to_learn_from(colors, self.rows, axes_of(given.views))
+        found = fit_light(track_colors(given.views, given.observations), self.rows, axes_of(given.views))
         known = found.seen >= MIN_SEEN
         self.stops[known], self.cameras = found.stops[known], found.cameras
 

@@ -23,7 +23,7 @@ from surfkit.scene.observations import Observations
 from surfkit.scene.response import CENTRE, CURVE, FALLOFF, mean_falloff
 from surfkit.scene.scene import Scene, View
 from surfkit.scene.track_colors import axes_of, rows_of, track_colors
-from surfkit.scene.track_light import MIN_SEEN, TrackLight, light_to_learn_from
+from surfkit.scene.track_light import MIN_SEEN, TrackLight, fit_light
 
 Shot = TypeVar("Shot")
 """A photograph."""
@@ -163,7 +163,7 @@ def sampled_by_tracks(views: Sequence[View], tracks: Observations) -> Sequence[V
 
 def light_by_tracks(views: Sequence[View], tracks: Observations) -> TrackLight:
     """The light of some photographs, from the sparse points that they show."""
-    return light_to_learn_from(track_colors(views, tracks), rows_of(views), axes_of(views))
+    return fit_light(track_colors(views, tracks), rows_of(views), axes_of(views))
 
 
 def recorded(light: TrackLight, views: Sequence[View]) -> LightRecord:

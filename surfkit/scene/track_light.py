@@ -37,8 +37,6 @@ LEAST_PROGRESS = 1e-5
 """The fit ends where a round lowers its cost by a smaller share."""
 ROBUST = 2.0
 """Differences of so many standard deviations count half (Cauchy)."""
-MAX_DRIFT = 0.5
-"""Stops, from the photograph whose exposure a slope lowers most to the one that it raises most."""
 MIN_SEEN = 10
 """Points that a photograph must share with others to be compared with them."""
 MEANS = 3
@@ -134,21 +132,6 @@ def shown_twice(photo: np.ndarray, point: np.ndarray) -> np.ndarray:
 def different(photo: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Photographs and points (K,) of sights, each pair once; tracks may hold a photograph twice."""
     return np.divmod(np.unique(photo * (most := point.max(initial=0) + 1) + point), most)
-
-
-def light_to_learn_from(colors: TrackColors, taken_by: np.ndarray, axes: np.ndarray) -> TrackLight:
-    """The light of photographs that are compared with one another as they are, without what a slope changes in them.
-
-    Where points have one colour for all directions, the exposures that explain them best absorb a part of the slope,
-    and photographs agree better than with the true ones. But they must not drift: where they differ by more than
-    `MAX_DRIFT` from those that are found with a slope, these are taken.
-
-    Args:
-        colors, taken_by, axes: See `fit_light`.
-    """
-    plain, sloped = fit_light(colors, taken_by, np.zeros_like(axes)), fit_light(colors, taken_by, axes)
-    apart = (plain.stops - sloped.stops)[plain.seen >= MIN_SEEN].mean(1)
-    return sloped if len(apart) and np.ptp(apart) > MAX_DRIFT else plain
 
 
 @dataclass(frozen=True)

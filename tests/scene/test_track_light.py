@@ -13,7 +13,7 @@ from surfkit.scene.response import curved
 from surfkit.scene.scene import View
 from surfkit.scene.srgb import from_linear, linear
 from surfkit.scene.track_colors import TrackColors, axes_of, rows_of, sensor_axes, track_colors
-from surfkit.scene.track_light import MAX_DRIFT, MIN_SEEN, fit_light, light_to_learn_from
+from surfkit.scene.track_light import MIN_SEEN, fit_light
 
 PHOTOS, POINTS = 30, 400
 CORNER, BALANCE = 0.5, 0.15
@@ -199,36 +199,6 @@ def test_what_no_number_explains_does_not_add_up_along_a_line():
     colors, stops, _, _ = flight(1, 60, exposures=0.5)
     off = fitted(colors, np.zeros(60, np.int64)).stops - stops[:, None]
     assert np.abs(off).max() < 0.2, "a change of the light that is there stays"
-
-
-def test_a_slope_changes_exposures_only_where_they_would_drift():
-    """0.3 stops across each picture; the exposures are all the same."""
-    for photographs, drifts in ((10, False), (60, True)):
-        colors, _, axes, _ = flight(1, photographs, slope=0.25)
-        one = np.zeros(photographs, np.int64)
-        light, plain = light_to_learn_from(colors, one, axes), fitted(colors, one)
-        assert light.slope.any() == drifts
-        if drifts:
-            assert np.ptp(light.stops.mean(1)) < 0.6 < 2 < np.ptp(plain.stops.mean(1))
-        else:
-            assert np.array_equal(light.stops, plain.stops)
-            apart = (plain.stops - fit_light(colors, one, axes).stops).mean(1)
-            assert 0.05 < np.ptp(apart) < MAX_DRIFT
-
-
-def test_photographs_that_share_too_little_decide_nothing_about_a_slope():
-    """At the ends of a line: with them exposures drift too far, without them not."""
-    colors, _, axes, _ = flight(1, 22, slope=0.25)
-    one, keep = np.zeros(22, np.int64), (colors.photo > 1) & (colors.photo < 20)
-    for end in (0, 1, 20, 21):
-        keep[np.flatnonzero(colors.photo == end)[::35][: MIN_SEEN - 1]] = True
-    few = TrackColors(*(each[keep] for each in vars(colors).values()))
-    plain, light = fitted(few, one), light_to_learn_from(few, one, axes)
-    apart = (plain.stops - fit_light(few, one, axes).stops).mean(1)
-    assert np.ptp(apart) > MAX_DRIFT > np.ptp(apart[2:20]) and plain.seen[[0, 1, 20, 21]].max() < MIN_SEEN
-    assert not light.slope.any()
-    nothing = TrackColors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)))
-    assert not light_to_learn_from(nothing, one, axes).stops.any()
 
 
 def test_axes_turn_places_on_the_sensor_into_directions():

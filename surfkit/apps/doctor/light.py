@@ -15,7 +15,7 @@ from surfkit.io.datasets.undistort import is_panorama
 from surfkit.runs.recipe import Recipe
 from surfkit.scene.light_spread import LightSpread
 from surfkit.scene.track_colors import TrackColors, sensor_axes
-from surfkit.scene.track_light import MIN_SEEN, light_to_learn_from
+from surfkit.scene.track_light import MIN_SEEN, fit_light
 
 MIN_PHOTOGRAPHS = 3
 """Photographs that are compared, at least."""
@@ -52,7 +52,7 @@ def uneven_light(gathered: Gathered, known: Mapping[str, Photograph], xyz: np.nd
     names = cameras_of(shots)
     cameras = {name: row for row, name in enumerate(dict.fromkeys(names))}
     tracks = TrackColors(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-    light = light_to_learn_from(tracks, np.array([cameras[name] for name in names]), axes)
+    light = fit_light(tracks, np.array([cameras[name] for name in names]), axes)
     spread = LightSpread.of(light)
     if not spread.is_uneven:
         return []
