@@ -7,6 +7,7 @@ import numpy as np
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import Component, name_of
 from surfkit.runs.folder import Run
+from surfkit.runs.recipe import Recipe
 from surfkit.scene.scene import Scene
 from surfkit.train.smaller import MIN_SIDE_PX
 from surfkit.train.stage import Stage
@@ -22,7 +23,8 @@ def warn_before(run: Run, scene: Scene, state: StageState | None) -> None:
     """Say what will not happen as one may expect, before a run begins or goes on from a state."""
     warn_of_gaps(scene, state)
     warn_of_no_edits(run, scene)
-    warn_of_plain_blocks(run)
+    if text := plain_blocks(run.recipe):
+        emit(Warned(text))
     warn_of_sizes(run, scene)
 
 
@@ -45,19 +47,14 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
                 emit(Warned(f"{at.setting}.prune.{number}: {name_of(prune)} {due} change that"))
 
 
-def warn_of_plain_blocks(run: Run) -> None:
-    """Say what of pretraining the tuning of blocks is without, where nobody has said how they are tuned."""
-    if run.recipe.partition is None:
-        return
-    tune, plain = _parts(run.recipe.tune), _parts(Stage())
-    other = [f"tune.{path}:{name}" for path, name in _parts(run.recipe.pretrain).items() if tune.get(path) != name]
-    if tune == plain and other:
-        emit(
-            Warned(
-                f"blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add "
-                f"{' '.join(other)}, and their settings"
-            )
-        )
+def plain_blocks(recipe: Recipe) -> str | None:
+    """What the tuning of blocks lacks of pretraining, where nobody has said how they are tuned; None for nothing."""
+    tune, plain = _parts(recipe.tune), _parts(Stage())
+    other = [f"tune.{path}:{name}" for path, name in _parts(recipe.pretrain).items() if tune.get(path) != name]
+    if recipe.partition is None or tune != plain or not other:
+        return None
+    told = "blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add"
+    return f"{told} {' '.join(other)}, and their settings"
 
 
 def _parts(stage: Stage) -> dict[str, str]:

@@ -246,17 +246,16 @@ def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data,
 
 
 def test_blocks_that_nobody_said_how_to_tune_are_told(recipe, data, tmp_path, monkeypatch):
-    texts, cut = [], QuantileGrid((1, 1))
-    monkeypatch.setattr(warn, "emit", lambda event: texts.append(event.text))
-    whole = recipes()["2dgs"]
+    cut, whole = QuantileGrid((1, 1)), recipes()["2dgs"]
     for each in (whole, replace(whole, partition=cut, tune=whole.pretrain), replace(recipes()["3dgs"], partition=cut)):
-        warn.warn_of_plain_blocks(Run(tmp_path, each, data))
-    assert texts == []
-    warn.warn_of_plain_blocks(Run(tmp_path, replace(whole, partition=cut), data))
-    assert texts == [
+        assert warn.plain_blocks(each) is None
+    texts = []
+    monkeypatch.setattr(warn, "emit", lambda event: texts.append(event.text))
+    warn.warn_before(Run(tmp_path, replace(whole, partition=cut), data), read(data), None)
+    assert (
         "blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add "
         "tune.losses.normal:normal tune.losses.distortion:distortion, and their settings"
-    ]
+    ) in texts
 
 
 def test_a_prune_that_is_never_due_is_told_before_the_run(recipe, data, tmp_path, monkeypatch):

@@ -32,6 +32,7 @@ from surfkit.io.datasets.sparse_points import RANDOM_POINTS
 from surfkit.io.datasets.undistort import cache_folder, is_panorama, is_pinhole
 from surfkit.runs.photo_light import sampled
 from surfkit.runs.recipe import Recipe
+from surfkit.runs.warn import plain_blocks
 from surfkit.scene.connected_photos import groups_warning, untied_warning
 from surfkit.scene.decoded_photos import place
 from surfkit.scene.photos import refuse_large
@@ -114,6 +115,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_untied(gathered),
         *uneven_light(gathered, known, compared, recipe),
         *priors(data, gathered, recipe, quick),
+        *([Finding("warning", "blocks", text)] if (text := plain_blocks(recipe)) else []),
     ]
     findings.sort(key=lambda finding: FINDING_LEVELS.index(finding.level))
     found = _found(data, gathered, geometry, looks)

@@ -23,6 +23,7 @@ from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import write_map
 from surfkit.io.datasets.raw_dataset import load_pycolmap
 from surfkit.losses import NormalPrior
+from surfkit.partition import QuantileGrid
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[3] / "examples" / "boruszyn"
@@ -384,6 +385,13 @@ def test_what_depends_on_the_recipe(farm):
     assert priors.text.startswith("13 of 14 photographs have no depth prior") and len(priors.names) == 13
     near = evolve(recipes()["2dgs"], "pretrain.near", 10.0)
     assert "nearer to the camera than the near plane" in told(farm, near)["near-plane"][0].text
+
+
+def test_what_blocks_are_tuned_without_is_told(farm):
+    whole = recipes()["2dgs"]
+    (said,) = told(farm, replace(whole, partition=QuantileGrid((1, 1))), quick=True)["blocks"]
+    assert said.level == "warning" and "tune.losses.normal:normal" in said.text
+    assert "blocks" not in told(farm, whole, quick=True) and "blocks" not in told(farm, "citygs2", quick=True)
 
 
 def test_depth_priors_without_the_normals_that_a_loss_wants(farm):
