@@ -49,9 +49,10 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
 
 def plain_blocks(recipe: Recipe) -> str | None:
     """What the tuning of blocks lacks of pretraining, where nobody has said how they are tuned; None for nothing."""
-    tune, plain = _parts(recipe.tune), _parts(Stage())
+    if recipe.partition is None or (tune := _parts(recipe.tune)) != _parts(Stage()):
+        return None
     other = [f"tune.{path}:{name}" for path, name in _parts(recipe.pretrain).items() if tune.get(path) != name]
-    if recipe.partition is None or tune != plain or not other:
+    if not other:
         return None
     told = "blocks are tuned as 3DGS is, without some parts of pretrain; to keep these, add"
     return f"{told} {' '.join(other)}, and their settings"

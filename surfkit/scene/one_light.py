@@ -84,6 +84,12 @@ class OneLight:
         return exposed(straight, np.exp2(stops).clip(1 / MAX_GAIN, MAX_GAIN))
 
     @property
+    def gains(self) -> tuple[float, float]:
+        """Least and greatest factor of the light of a photograph, at the optical axis, as it is applied."""
+        found = np.exp2(-self.stops).clip(1 / MAX_GAIN, MAX_GAIN)
+        return float(found.min()), float(found.max())
+
+    @property
     def corners(self) -> np.ndarray:
         """(C,) light in the corners of the photographs of each camera, as a share of that in the middle."""
         return np.array([corner_light(values) for values in self.cameras])

@@ -190,3 +190,13 @@ def test_no_light_is_changed_by_more_than_two_stops():
     )
     found = linear(light.even_at(np.full((2, 3), from_linear(np.array(0.1))), np.arange(2), np.zeros((2, 2))))
     np.testing.assert_allclose(found, 0.1 * np.array([[MAX_GAIN], [1 / MAX_GAIN]]).repeat(3, 1))
+
+
+def test_gains_that_are_told_are_those_that_are_applied():
+    stops, zeros = np.array([[0.5, 0.5, 0.5], [-3.0, -3.0, -3.0]]), np.zeros(2)
+    light = OneLight(stops, np.zeros((2, 2, 3)), zeros, zeros.astype(np.int64), np.zeros((1, 8)))
+    assert light.gains == pytest.approx((2**-0.5, MAX_GAIN))
+    dark = from_linear(np.full((1, 3), 0.01))
+    for photo, gain in enumerate(light.gains):
+        even = light.even_at(dark, np.array([photo]), np.zeros((1, 2)))
+        np.testing.assert_allclose(linear(even) / 0.01, gain, rtol=1e-6)

@@ -39,7 +39,7 @@ from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
-from surfkit.scene.one_light import MAX_GAIN, OneLight
+from surfkit.scene.one_light import OneLight
 from surfkit.scene.scene import Frame, View
 
 Format = Literal["obj", "glb", "tiles3d", "usdz"]
@@ -179,9 +179,7 @@ def facts_of(made: TexturedMesh, subject: MeshWithPhotos) -> dict[str, Any]:
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),
         "photographs": len(np.unique(atlas.view[seen])),
         "outliers": made.outliers,
-        "gains": [
-            round(min(MAX_GAIN, max(1 / MAX_GAIN, float(2**-it))), 4) for it in (light.stops.max(), light.stops.min())
-        ],
+        "gains": [round(gain, 4) for gain in light.gains],
         "corners": [round(float(light.corners.min()), 4), round(float(light.corners.max()), 4)],
         "charts": len(atlas.page),
         "pages": [[page.width, page.height] for page in atlas.pages],

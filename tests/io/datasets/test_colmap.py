@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -197,6 +198,11 @@ def test_wrong_settings(made, tmp_path, settings, text):
             path.write_text(settings["test_list"])
         settings = {"test_list": path}
     complaint(text, lambda: read(Data(made[0], **settings)))
+
+
+def test_the_only_photograph_is_not_held_out_unasked():
+    alone = SimpleNamespace(shots=[SimpleNamespace(name="a.jpg")], held_out=None)
+    complaint("--test-every 8 holds out the only photograph; use --test-every 0", lambda: Data(Path()).held_out(alone))
 
 
 def complaint(text, do):
