@@ -16,7 +16,7 @@ from typing import Any
 
 from surfkit.core.tree import evolve
 from surfkit.runs.recipe import Recipe
-from surfkit.study.ablation import Row, Table, build, built_on
+from surfkit.study.ablation import Row, Table, build, built_on, offered_tables
 from surfkit.study.recipes.ablations import GRADIENT_TABLE, MODEL_TABLE
 
 RAISED = 10.0
@@ -62,4 +62,15 @@ def trimmed() -> Table:
     )
 
 
-TABLES = {table.name: at_length(table) for table in (GRADIENT_TABLE, MODEL_TABLE, trimmed())}
+BEST = ("surface (ours)", "Octree-GS", "Scaffold-GS", "MetroGS", "DOGS", "CityGaussianV2", "CityGaussian", "AbsGS")
+"""Of `table:methods` after 1,000 steps, by F1; 2DGS, 3DGS and stereo, which they are compared with, are rows too."""
+
+
+def methods() -> Table:
+    """`table:methods` with its best rows alone."""
+    table = offered_tables()["methods"]
+    kept = {"2DGS", "3DGS", "stereo alone", *BEST}
+    return replace(table, rows=tuple(row for row in table.rows if row.label in kept))
+
+
+TABLES = {table.name: at_length(table) for table in (GRADIENT_TABLE, MODEL_TABLE, trimmed(), methods())}
