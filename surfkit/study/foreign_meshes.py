@@ -18,6 +18,7 @@ from surfkit.study.ablation import Row, Table
 from surfkit.study.row_comparison import compared, surface_figures
 from surfkit.study.rows import TrialResult
 from surfkit.study.truth import Truth
+from surfkit.train.progress_bars import bars
 
 MESHES_FOLDER = "meshes"
 """In that of a table: what was measured of meshes of other programs."""
@@ -83,7 +84,8 @@ def measured_mesh(mesh: OtherMesh, truth: Truth, data: Data, out: Path) -> Trial
     """The numbers of a mesh, which is measured if it was not yet, or why it could not be."""
     try:
         if mesh.figures(truth, out) is None:
-            mesh.measure(truth, data, out)
+            with bars():
+                mesh.measure(truth, data, out)
         return TrialResult(mesh.figures(truth, out))
     except BadInput as error:
         return TrialResult(failed=" ".join(str(error).split()))

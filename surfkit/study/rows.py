@@ -33,6 +33,7 @@ from surfkit.study.perceptual import measure_lpips
 from surfkit.study.row_comparison import figures
 from surfkit.study.truth import Truth
 from surfkit.train.data_cache import CacheSettings
+from surfkit.train.progress_bars import bars
 
 TRACEBACK_FILE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""
@@ -109,7 +110,7 @@ def attempt(work: TrialJob) -> TrialResult:
     try:
         if found is None:
             found = figures(train(work), trial.recipe.compress is not None)
-        with collect_notes():
+        with collect_notes(), bars():
             found = measured(work, found)
     except (BadInput, Fault) as error:
         return TrialResult(found, " ".join(str(error).split()))

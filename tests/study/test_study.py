@@ -12,6 +12,7 @@ from rich.console import Console
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
+from surfkit.core.events import Progress, emit
 from surfkit.core.registry import find
 from surfkit.densify import CountCap, Elongation
 from surfkit.densify.base import Prune
@@ -274,7 +275,7 @@ def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs,
         ablate(plan, Silent())
 
 
-def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp_path):
+def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp_path, capsys):
     from surfkit.study import truth
 
     calls = []
@@ -293,6 +294,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
         if "bad" in calls:
             raise BadInput("nowhere near")
         calls.append(settings.crop)
+        emit(Progress("counting the views of each point", 1, 9))
         write_json(out / "crop.json", {})
         found = {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
         return {"geometry": found, "mesh": {"components": len(calls)}}
@@ -309,6 +311,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
     report = ablate(plan, Silent())
     assert [row["mean"]["f1"] for row in rows_in(report)] == [0.25, 0.25, 0.5]
     assert rows_in(report)[2]["difference"]["f1"]["mean"] == 0.25
+    assert capsys.readouterr().err.count("counting the views of each point") == 2, "it takes minutes"
     assert calls == ["auto", str(plan.truth[0].crop(plan.out))], "the second row is measured in the volume of the first"
     assert "| **0.500** (+0.250) | **100** (-66.7 %) | 1.5 (+0.0 %) |" in (plan.out / "ablation.md").read_text()
     assert ablate(plan, Silent()) == report and len(calls) == 2 and len(runs.calls) == 2
