@@ -55,7 +55,7 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.matched import MatchedADC
 from surfkit.densify.prune import PruneByOpacity
 from surfkit.densify.signal import AbsGradient
-from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate, KnownSurface, KnownSurfaces
 from surfkit.depth.fill_base import Fill, FillInput
 from surfkit.depth.filled import Filled
 from surfkit.depth.patch_match import PatchMatch
@@ -128,6 +128,7 @@ from surfkit.train.faults import Diverged
 from surfkit.train.interrupt import graceful
 from surfkit.train.optimizer import Optimizer, OptimizerInput
 from surfkit.train.refine.base import Refine
+from surfkit.train.refine.rendered_depth import RenderedDepth
 from surfkit.train.stage import Stage
 from surfkit.train.state import StageState
 from surfkit.train.trainer import CompletedStep, Trainer
@@ -202,6 +203,8 @@ __all__ = [
     "Interval",
     "Job",
     "JobResult",
+    "KnownSurface",
+    "KnownSurfaces",
     "L1",
     "LazyCommand",
     "Leaf",
@@ -254,6 +257,7 @@ __all__ = [
     "Recipe",
     "Reconstruction",
     "Refine",
+    "RenderedDepth",
     "Regularizer",
     "RegularizerInput",
     "Render",

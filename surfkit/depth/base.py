@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -18,6 +18,32 @@ from surfkit.scene.scene import View
 
 
 @dataclass(frozen=True)
+class KnownSurface:
+    """What is known of the surface in a photograph before its depth is estimated, such as what a model draws.
+
+    Attributes:
+        inverse: (h, w) float32 inverse camera z, 1/local units; 0 where nothing is known.
+        normal: (3, h, w) float32 unit normals in the camera's axes, towards the camera; 0 where none is known.
+    """
+
+    inverse: Tensor
+    normal: Tensor
+
+
+@dataclass(frozen=True)
+class KnownSurfaces:
+    """What an estimate goes on from.
+
+    Attributes:
+        see: Gives the surface of the view at a position, as a camera in its place sees it.
+        key: Another one where the surfaces are others.
+    """
+
+    see: Callable[[int, Camera], KnownSurface]
+    key: str
+
+
+@dataclass(frozen=True)
 class DepthInput:
     """The photographs and sparse points that depth is estimated from.
 
@@ -28,6 +54,7 @@ class DepthInput:
         work: A folder for what an interrupted estimate can go on from; it is deleted when all is done.
         in_one_light: Whether the photographs are known to be, as rendered ones are. Their colours at sparse points are
             not compared then, and the points need not be of the surface.
+        known: Surfaces that an estimator which `continues` begins with; None for none.
     """
 
     views: Sequence[View]
@@ -35,6 +62,7 @@ class DepthInput:
     device: torch.device
     work: Path
     in_one_light: bool = False
+    known: KnownSurfaces | None = None
 
 
 @dataclass(frozen=True)
@@ -61,13 +89,15 @@ class DepthEstimator(Component):
 
     `aligned` estimators give inverse depth in the units of the scene, others up to scale and offset. The ones that are
     `matched` compare photographs with one another, so they must not see those that are kept to measure with; those that
-    are `oriented` give normals too. The `version` is raised when the same settings give other maps: what is kept of
-    earlier ones is not used again. Maps do not depend on the masks of photographs: they are kept when masks change.
+    are `oriented` give normals too, and one that `continues` begins with surfaces that are known. The `version` is
+    raised when the same settings give other maps: what is kept of earlier ones is not used again. Maps do not depend on
+    the masks of photographs: they are kept when masks change.
     """
 
     aligned: ClassVar[bool] = False
     matched: ClassVar[bool] = False
     oriented: ClassVar[bool] = False
+    continues: ClassVar[bool] = False
     version: ClassVar[int] = 1
 
     @abstractmethod

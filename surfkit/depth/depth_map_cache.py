@@ -11,14 +11,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from surfkit.core.check import BadInput, Fault, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import DISK_FULL, sweep
 from surfkit.core.lock import IN_USE_FILE, is_used, lock_holder, locked, mark_used
-from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare_depth_maps import DepthPreparation, fault_of, files_of, without_damaged
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, is_whole, map_path, read_record, write_record
 from surfkit.io.datasets.depth_map_index import DepthMapIndex, folder_of, read_made, write_made
@@ -33,19 +30,18 @@ DROPPED = ".dropped-"
 """What names of folders begin with that are being deleted."""
 
 
-def key_of(
-    estimator: DepthEstimator, scene: Scene, prints: Fingerprint, tracks: Observations, device: torch.device
-) -> str:
+def key_of(preparation: DepthPreparation, scene: Scene, prints: Fingerprint, tracks: Observations) -> str:
     """The name of the maps of the training views of a scene: another one when anything differs that they are made from.
 
     Args:
-        estimator: How they are made.
+        preparation: How they are made. Maps of a GPU are as good as those of a CPU, and have other bits.
         scene: With the training views.
         prints: Of its photographs and cameras.
         tracks: Its observations.
-        device: Where they are made: maps of a GPU are as good as those of a CPU, and have other bits.
     """
+    estimator, device = preparation.estimator, preparation.device
     parts = [] if device.type == "cpu" else [device.type]
+    parts += [] if preparation.known is None else [preparation.known.key]
     parts += [str(dump(estimator)), str(estimator.version), repr(float(scene.frame.scale))]
     parts += [digest(tracks.xyz), digest(tracks.error_px), *files_of(estimator, scene.train)]
     for view in scene.train:

@@ -90,6 +90,11 @@ class Filled(DepthEstimator):
         return self.stereo.oriented
 
     @property
+    def continues(self) -> bool:  # type: ignore[override]  # likewise
+        """See `DepthEstimator`."""
+        return self.stereo.continues
+
+    @property
     def version(self) -> int:  # type: ignore[override]  # of both
         """See `DepthEstimator`."""
         return 1000 * FILL_VERSION + self.stereo.version

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.depth.base import KnownSurface
+from surfkit.depth.cost_volume import ray_map
 from surfkit.raster.native import kernels, lacking, module
 from surfkit.scene.camera import Camera
 
@@ -20,6 +22,8 @@ BRIGHTNESS_PIXELS = 2000
 """Pixels, about, by which the brightness of two pictures is compared."""
 MAX_MATCHING_COST, MIN_MATCHING_PIXELS = 0.3, 50
 """Only pixels that match at less than this cost are used for that, if there are more than so many."""
+MIN_FACING = 0.1
+"""Cosine of the angle between ray and normal of a known surface; with less it is seen at a grazing angle."""
 MAX_BRIGHTNESS_GAIN = 4.0
 """Largest gain, and one over the least."""
 
@@ -71,6 +75,25 @@ class Planes:
         value = np.zeros((*inverse.shape, 3), np.float32)
         value[..., 0] = inverse
         return cls(value, np.full(inverse.shape, 2, np.float32), np.full((*inverse.shape, views), 255, np.uint8))
+
+    def lie_in(self, surface: KnownSurface, camera: Camera, span: tuple[float, float]) -> None:
+        """Take the planes of a surface where it is known, and between two inverse depths; see `PlaneMap.normals`.
+
+        Where it is seen at a grazing angle, or its normal is not known, they face the camera.
+
+        Args:
+            surface: As the camera sees it.
+            camera: Of the picture.
+            span: Least and greatest inverse depth.
+        """
+        inverse, normal = surface.inverse.to("cpu"), surface.normal.to("cpu")
+        rays = camera.rays().to(inverse.dtype)
+        facing = (normal * rays).sum(0)
+        steep = facing.abs() < MIN_FACING * rays.norm(dim=0)
+        away = torch.where(steep, 0, normal[:2] * inverse / torch.where(steep, 1, facing))
+        value = torch.stack([inverse, away[0] / camera.fx, away[1] / camera.fy], -1).numpy()
+        there = ((inverse >= span[0]) & (inverse <= span[1])).numpy()
+        self.value[there] = value[there]
 
     def resized(self, height: int, width: int) -> Planes:
         """The same planes at another size."""
@@ -240,3 +263,15 @@ def way(here: Camera, there: Camera) -> list[float]:
 def lens(camera: Camera) -> np.ndarray:
     """(3, 3) from rays to pixels that are numbered from the middle of the first one."""
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+
+
+def parallax_of(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> float:
+    """Pixels by which other pictures move, a unit of inverse depth, about the median of the planes; the mean of all."""
+    middle, moves = float(np.median(planes.value[..., 0])), []
+    low, high = 0.98 * middle, 1.02 * middle
+    for other in others:
+        a, b = (part.numpy() for part in ray_map(here.camera, other.camera, torch.device("cpu")))
+        near, far = (a[:, ::16, ::16] + c * b[:, None, None] for c in (low, high))
+        shift = near[:2] / near[2] - far[:2] / far[2]
+        moves.append(float(np.median(np.hypot(*shift))) / (high - low))
+    return float(np.mean(moves))

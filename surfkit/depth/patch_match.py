@@ -9,7 +9,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
@@ -18,9 +17,8 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
-from surfkit.depth.cost_volume import ray_map
 from surfkit.depth.cuda.passes import GpuPasses
-from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, require_native
+from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, parallax_of, require_native
 from surfkit.depth.neighbours import depth_range, in_turn, neighbours
 from surfkit.depth.photo_light import EvenLight, stretched
 from surfkit.depth.plane_map import PlaneMap, inverse_of, load_map, save_map
@@ -77,6 +75,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
+    continues: ClassVar[bool] = True
     version: ClassVar[int] = 11
 
     longest: int = 1600
@@ -321,8 +320,9 @@ class PatchMatchWorkspace:
             near = near.union(*(self.pairs[each] for each in near))
 
     def match(self, at: int) -> PlaneMap | None:
-        """By photometric consistency, from coarse to fine; None without neighbours, parallax or sparse points."""
-        others = self.pairs[at]
+        """By photometric consistency, from coarse to fine, or at full size from a surface that is known; None without
+        neighbours, parallax or sparse points."""
+        others, known = self.pairs[at], self.given.known
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         begun = self.sweep.sweep(
             self.given, at, self.small(at), [self.small(o) for o in others[: self.sweep.neighbours]]
@@ -330,9 +330,12 @@ class PatchMatchWorkspace:
         if span is None or begun is None:
             return None
         planes, parallax = Planes.at(begun[0].cpu().numpy(), len(others)), 0.0
-        for level in range(self.levels(at), -1, -1):
+        coarsest = self.levels(at) if known is None else 0
+        for level in range(coarsest, -1, -1):
             here, there = self.grey(at, level), [self.grey(o, min(level, self.levels(o))) for o in others]
             planes = planes.resized(here.camera.height, here.camera.width)
+            if known is not None:
+                planes.lie_in(known.see(at, here.camera), here.camera, span)
             parallax = parallax_of(here, there, planes)
             if parallax <= 0:
                 return None  # all were taken from the same place
@@ -342,7 +345,7 @@ class PatchMatchWorkspace:
                     self.terms(span, parallax),
                     jitter_px=JITTER_PX * 2 ** (passes - 1 - index),
                     samples=FULL_WINDOW_PIXELS if level == 0 and index == passes - 1 else COARSE_WINDOW_PIXELS,
-                    survey=index == 0 and level == self.levels(at),
+                    survey=index == 0 and level == coarsest,
                 )
                 self.improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
         return PlaneMap(planes.value, planes.each, parallax)
@@ -383,15 +386,3 @@ class PatchMatchWorkspace:
             window=settings.window,
             survey=False,
         )
-
-
-def parallax_of(here: GreyImage, others: Sequence[GreyImage], planes: Planes) -> float:
-    """Pixels by which other pictures move, a unit of inverse depth, about the median of the planes; the mean of all."""
-    middle, moves = float(np.median(planes.value[..., 0])), []
-    low, high = 0.98 * middle, 1.02 * middle
-    for other in others:
-        a, b = (part.numpy() for part in ray_map(here.camera, other.camera, torch.device("cpu")))
-        near, far = (a[:, ::16, ::16] + c * b[:, None, None] for c in (low, high))
-        shift = near[:2] / near[2] - far[:2] / far[2]
-        moves.append(float(np.median(np.hypot(*shift))) / (high - low))
-    return float(np.mean(moves))

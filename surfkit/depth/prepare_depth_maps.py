@@ -19,7 +19,7 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.registry import name_of
 from surfkit.core.version import own_version
-from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate, KnownSurfaces
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import (
     DEPTH_FOLDER,
@@ -73,12 +73,14 @@ class DepthPreparation:
         estimator: How.
         device: Where to compute.
         root: The folder in which estimated_depths/ is written; the data set if None.
+        known: What the estimator begins with, if it `continues`.
     """
 
     data: Data
     estimator: DepthEstimator
     device: torch.device
     root: Path | None = None
+    known: KnownSurfaces | None = None
 
     @property
     def place(self) -> Path:
@@ -102,7 +104,7 @@ class DepthPreparation:
         """
         tracks = tracks or observations(self.data, scene)
         self.refuse_unfit(scene, tracks)
-        return DepthInput(self.views(scene), tracks, self.device, self.work)
+        return DepthInput(self.views(scene), tracks, self.device, self.work, known=self.known)
 
     def refuse_unfit(self, scene: Scene, tracks: Observations) -> None:
         """BadInput if the settings do not fit the photographs, or the sparse model does not show which to compare."""

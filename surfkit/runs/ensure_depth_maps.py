@@ -13,7 +13,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
-from surfkit.depth.base import DepthEstimator
+from surfkit.depth.base import DepthEstimator, KnownSurfaces
 from surfkit.depth.depth_map_cache import key_of, maps
 from surfkit.depth.prepare_depth_maps import REMEDY, WITHOUT_DEPTH, DepthPreparation, others_warning
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DepthFile
@@ -112,10 +112,19 @@ def with_maps_of(run: Run, scene: Scene, caches: CacheSettings, device: Device, 
 
 @contextmanager
 def made_maps(
-    run: Run, estimator: DepthEstimator, scene: Scene, prints: Fingerprint, caches: CacheSettings, device: Device
+    run: Run,
+    estimator: DepthEstimator,
+    scene: Scene,
+    prints: Fingerprint,
+    caches: CacheSettings,
+    device: Device,
+    known: KnownSurfaces | None = None,
 ) -> Iterator[Path | None]:
-    """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any."""
-    preparation = DepthPreparation(run.data, estimator, torch_device(device))
+    """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any.
+
+    `known`: what the estimator begins with.
+    """
+    preparation = DepthPreparation(run.data, estimator, torch_device(device), known=known)
     tracks = observations(run.data, scene)
     try:
         preparation.refuse_unfit(scene, tracks)
@@ -125,9 +134,9 @@ def made_maps(
         return
     if notice := estimator.notice():
         emit(Warned(notice))
-    if (folder := run.data.path / DEPTH_FOLDER).is_dir():
+    if known is None and (folder := run.data.path / DEPTH_FOLDER).is_dir():
         emit(Warned(f"{folder} has no map of these photographs, so others are made"))
-    key = key_of(estimator, scene, prints, tracks, preparation.device)
+    key = key_of(preparation, scene, prints, tracks)
     with maps(preparation, scene, tracks, key, caches.maps_bytes()) as (folder, made):
         count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
         how = f"made with {name_of(estimator)} in {made.cpu_seconds:.0f} s of CPU time"

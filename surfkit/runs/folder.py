@@ -169,8 +169,10 @@ class Run:
 
     @property
     def needs_priors(self) -> bool:
-        """Whether training looks at depth priors: the method, a loss of the recipe, or its start."""
-        losses = [loss for _, stage, _ in self.recipe.stages() for loss in stage.losses.values()]
+        """Whether training looks at depth priors: the method, a loss of the recipe, or its start. Refinements that make
+        their own do not count."""
+        own = {f"refine.{at}.stage" for at, refine in enumerate(self.recipe.refine) if refine.estimator is not None}
+        losses = [loss for path, stage, _ in self.recipe.stages() if path not in own for loss in stage.losses.values()]
         needed = self.recipe.method.needs_prior or self.recipe.start.needs_prior
         return needed or any(loss.needs_prior for loss in losses)
 

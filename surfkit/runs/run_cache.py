@@ -89,8 +89,10 @@ def parts(recipe: Recipe) -> Iterator[SharedPart]:
         last = "tune"
         yield SharedPart(last, "plan", _settings(recipe, TUNE_FIELDS), needs_priors(recipe.tune.losses))
     for at, refine in enumerate(recipe.refine):
-        needs_prior = needs_priors(refine.stage.losses) or any(mesher.needs_prior for mesher in refine.meshers)
-        yield SharedPart(f"refine{at}", last, dump(refine), needs_prior)
+        own = refine.estimator
+        needs_prior = (own is None and needs_priors(refine.stage.losses)) or any(m.needs_prior for m in refine.meshers)
+        settings = dump(refine) if own is None else [dump(refine), own.version]
+        yield SharedPart(f"refine{at}", last, settings, needs_prior)
         last = f"refine{at}"
     if recipe.mesh is not None:
         yield SharedPart("mesh", last, dump(recipe.mesh), recipe.mesh.needs_prior)

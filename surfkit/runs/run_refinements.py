@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import itertools
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
+from surfkit.io.datasets.depth_map_index import read_made
+from surfkit.io.datasets.fingerprint import Fingerprint, digest, fingerprint
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.base import Rasterizer
 from surfkit.runs.context import RunContext
+from surfkit.runs.ensure_depth_maps import made_maps, with_priors
 from surfkit.runs.folder import Run, RunStage, discard_results
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_mesh import mesh_input
@@ -23,7 +34,9 @@ from surfkit.runs.run_notes import prefix_notes
 from surfkit.runs.run_stage import StageJob, drawing, load_state, optimise
 from surfkit.scene.available_memory import cache_bytes
 from surfkit.scene.cache import Cache
+from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene
+from surfkit.scene.vectors import unit
 from surfkit.start.base import InitialModel
 from surfkit.train.data_cache import TrainingData, read_ahead
 from surfkit.train.memory_meter import MemoryMeter
@@ -72,14 +85,52 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     intervals = replace(ctx.intervals, pictures=0)
     stage.folder.mkdir(exist_ok=True)
-    with record_events(stage.folder), prefix_notes(f"{stage.title}: "):  # steps are counted from 1 again
+    with ExitStack() as use:
+        use.enter_context(record_events(stage.folder))
+        use.enter_context(prefix_notes(f"{stage.title}: "))  # steps are counted from 1 again
         if state is None:
             measure_before(stage, made(), scene)
         shown = _rendered_data(before, given, scene, ctx.rasterizer) if refine.taught else None
-        shown = shown or read_ahead(run.data, scene, stage.stage.losses, ctx.caches)
+        own, began = run, time.perf_counter()
+        if refine.estimator is not None:
+            folder = use.enter_context(_own_maps(ctx, before, given, stage, refine.estimator))
+            own, spent = with_priors(run, folder), read_made(folder).cpu_seconds  # also where they were made before
+            seconds = given.seconds + time.perf_counter() - began
+            given = replace(given, seconds=seconds, cpu_seconds=given.cpu_seconds + spent)
+        shown = shown or read_ahead(own.data, scene, stage.stage.losses, ctx.caches)
         meter, points_on = MemoryMeter.of_stage(), ctx.caches.points
         job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, meter, start, points_on, given)
         return optimise(job, state)
+
+
+@contextmanager
+def _own_maps(
+    ctx: RunContext, before: RunStage, given: StageState, stage: RunStage, estimator: DepthEstimator
+) -> Iterator[Path]:
+    """Within, there are depth maps that an estimator makes from what the model of the stage before draws: their folder.
+
+    Raises:
+        BadInput: They may not be made, or cannot.
+    """
+    run, scene = replace(ctx.run, data=replace(ctx.run.data, priors=None)), ctx.scene
+    if ctx.caches.maps is None:
+        raise BadInput(f"{stage.setting.rpartition('.')[0]}: it makes depth maps; leave out --no-prepare")
+    draw = lru_cache(1)(lambda: drawing(before, given, ctx.rasterizer))
+
+    def see(at: int, camera: Camera) -> KnownSurface:
+        maps = draw()(replace(scene.train[at], camera=camera))
+        depth, normal = maps.need("median"), unit(maps.need("normal"))
+        return KnownSurface(torch.where(depth > 0, 1 / depth.clamp_min(1e-12), 0), normal)
+
+    model = before.stage.finished(given)
+    prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)
+    known = KnownSurfaces(see, digest([model[name] for name in sorted(model)]))
+    device = ctx.rasterizer.where().type
+    with made_maps(run, estimator, scene, prints, ctx.caches, device, known) as folder:
+        if folder is None:
+            raise BadInput(f"{run.data.path}: {stage.setting.rpartition('.')[0]} needs depth maps; leave it out")
+        draw.cache_clear()  # activated values of the points take memory
+        yield folder
 
 
 def stage_scene(run: Run, stage: RunStage, scene: Scene) -> Scene:

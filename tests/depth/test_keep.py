@@ -170,10 +170,14 @@ def test_a_photograph_that_cannot_be_read_for_a_while_is_tried_again(farm, tmp_p
     assert made(farm)[0] == first - 1 and read_made(folder_of("some")).without == ("view_003.png",)
 
 
+def of(data, device="cpu"):
+    return DepthPreparation(data, FAST, torch.device(device))
+
+
 def test_maps_of_a_gpu_are_others_than_those_of_a_cpu(farm):
     scene = read(farm)
     named = [
-        keep.key_of(FAST, scene, fingerprint(scene), observations(farm, scene), torch.device(device))
+        keep.key_of(of(farm, device), scene, fingerprint(scene), observations(farm, scene))
         for device in ("cpu", "cuda:0", "cuda:1")
     ]
     assert named[0] != named[1] == named[2]
@@ -188,7 +192,7 @@ def test_masks_leave_the_name_of_maps(farm, tmp_path):
     scenes = read(farm), read(other)
     assert all(view.mask for view in scenes[1].train) and not any(view.mask for view in scenes[0].train)
     one, two = (
-        keep.key_of(FAST, scene, fingerprint(scene), observations(data, scene), torch.device("cpu"))
+        keep.key_of(of(data), scene, fingerprint(scene), observations(data, scene))
         for data, scene in zip((farm, other), scenes, strict=True)
     )
     assert one == two

@@ -11,7 +11,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.depth import patch_match
-from surfkit.depth.base import DepthInput
+from surfkit.depth.base import DepthInput, KnownSurface, KnownSurfaces
 from surfkit.depth.native_patch_match import GreyImage, MatchingSettings, Planes, improve, pattern, way
 from surfkit.depth.neighbours import in_turn, neighbours
 from surfkit.depth.patch_match import PatchMatch, PatchMatchWorkspace
@@ -615,3 +615,53 @@ def test_settings_that_make_no_sense_are_refused():
     ):
         with pytest.raises(BadInput):
             PatchMatch(**setting)
+
+
+def test_planes_lie_in_a_surface_that_is_known():
+    """A slanted plane, but where it is not known, out of range, seen at a grazing angle, or without a normal."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), 50.0, 40.0, 8.0, 6.0, 16, 12)
+    rays, away = camera.rays().double(), torch.tensor([0.3, -0.2, -1.0], dtype=torch.float64)
+    normal = away / away.norm()
+    inverse = (normal[:, None, None] * rays).sum(0) / -2.0  # the plane of all X with normal . X = -2
+    wanted = inverse.numpy()
+    normals = normal[:, None, None].repeat(1, 12, 16)
+    inverse[0], inverse[1] = 0, 5
+    normals[:, 2] = torch.linalg.cross(rays[:, 2].T, torch.tensor([1.0, 0, 0], dtype=torch.float64).expand(16, 3)).T
+    normals[:, 2] /= normals[:, 2].norm(dim=0)
+    normals[:, 3] = 0
+    planes = Planes.at(np.full((12, 16), 0.25, np.float32), 2)
+    planes.lie_in(KnownSurface(inverse.float(), normals.float()), camera, (0.1, 1.0))
+    np.testing.assert_allclose(planes.value[2:, :, 0], wanted[2:], rtol=1e-5)
+    np.testing.assert_allclose(planes.value[4:, :-1, 1], np.diff(wanted, axis=1)[4:], rtol=1e-3)
+    np.testing.assert_allclose(planes.value[4:-1, :, 2], np.diff(wanted, axis=0)[4:], rtol=1e-3)
+    assert (planes.value[:2] == [0.25, 0, 0]).all() and not planes.value[2:4, :, 1:].any()
+    found = PlaneMap(planes.value[4:], planes.each[4:], 1.0)
+    below = replace(camera, cy=camera.cy - 4, height=8)
+    torch.testing.assert_close(found.normals(below), normals[:, 4:].float(), atol=1e-4, rtol=0)
+
+
+def test_an_estimate_goes_on_from_what_is_known(farm, tmp_path):
+    """Exact surfaces stay, nearer to the truth than what is found without them; wrong and missing ones are mended."""
+    scene, tracks, truth = farm
+    exact = [truth.exact[view.name] for view in scene.train]
+
+    def known(square):
+        def see(at, camera):
+            assert (camera.width, camera.height) == (120, 90), "at full size"
+            inverse = torch.where(exact[at].depth > 0, 1 / exact[at].depth, 0).float()
+            inverse[30:42, 40:60] *= square
+            return KnownSurface(inverse, exact[at].normal.float())
+
+        return KnownSurfaces(see, str(square))
+
+    wrong = []
+    for number, given in enumerate((None, known(1.0), known(1.2), known(0.0))):
+        given = DepthInput(scene.train, tracks, CPU, tmp_path / str(number), known=given)
+        (found,) = PatchMatch(coarsest=32, rounds=1).estimate(given, [7])
+        depth = exact[7].depth.float()
+        error = torch.where(depth > 0, (1 / (found.inverse * depth) - 1).abs(), 0)
+        wrong.append([float((part > 0.02).float().mean()) for part in (error, error[30:42, 40:60])])
+    plain, exactly, *others = wrong
+    assert exactly[0] < 0.2 * plain[0]
+    for found in others:
+        assert found[0] < 0.5 * plain[0] and found[1] < 0.25, "neighbours and photographs decide"

@@ -10,8 +10,10 @@ from surfkit.plugin import (
     TSDF,
     Component,
     DepthRegression,
+    LearningRate,
     NormalConsistency,
     Recipe,
+    RenderedDepth,
     Row,
     Stage,
     Surfel2D,
@@ -20,12 +22,39 @@ from surfkit.plugin import (
 from surfkit_metrogs.densify import SparsityCompensation
 from surfkit_metrogs.losses import LargeScale
 
-# The stage of single views; its second half lacks the refined depth, see README.
+ROUNDS = 3
+"""Times that the depth maps are made again; the paper says "at fixed intervals"."""
+
+
+def position_rate(done: float, until: float) -> LearningRate:
+    """Of 3DGS, whose rate falls to a hundredth along all 60,000 steps, between two shares of them."""
+    return LearningRate(1.6e-4 * 100**-done, 1.6e-4 * 100**-until)
+
+
+def multi_view(index: int) -> RenderedDepth:
+    """A round of hybrid multi-view refinement (section 4.3.2, eq. 9 and 10)."""
+    shares = [0.5 + 0.5 * at / ROUNDS for at in (index, index + 1)]
+    return RenderedDepth(
+        stage=Stage(
+            steps=30_000 // ROUNDS,
+            losses={
+                "l1": L1(),
+                "ssim": SSIM(),
+                "normal": NormalConsistency(weight=0.0125, start=0, depth="median"),
+                "depth": DepthRegression(start=2.5, end=2.5),
+            },
+            densify=None,
+            rates={"means": position_rate(*shares)},
+        )
+    )
+
+
 METROGS = Recipe(
-    about="2DGS with depth from priors that splits large points of sparse places (parts of MetroGS, Chen et al. 2026)",
+    about="2DGS with depth from priors that splits large points of sparse places, then learns from depth that stereo "
+    "makes of its own (MetroGS, Chen et al. 2026, without its appearance)",
     primitive=Surfel2D(),
-    pretrain=Stage(
-        steps=60_000,
+    pretrain=Stage(  # single-view optimisation, section 4.3.1
+        steps=30_000,
         losses={
             "l1": L1(),
             "ssim": SSIM(),
@@ -34,7 +63,9 @@ METROGS = Recipe(
         },
         regularizers={"large": LargeScale()},
         densify=SparsityCompensation(until=15_000),
+        rates={"means": position_rate(0.0, 0.5)},
     ),
+    refine=tuple(multi_view(index) for index in range(ROUNDS)),
     mesh=TSDF(),
 )
 

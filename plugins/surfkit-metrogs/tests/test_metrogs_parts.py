@@ -250,8 +250,18 @@ def test_rows_are_built_on_those_that_they_belong_to():
 
 def test_the_recipe_is_as_published():
     stage: Stage = surfkit_metrogs.METROGS.pretrain
-    assert stage.steps == 60_000 and stage.densify.until == 15_000
-    assert stage.losses["depth"].weight_at(1, 60_000) == pytest.approx(0.5, rel=1e-3)
-    assert stage.losses["depth"].weight_at(60_000, 60_000) == pytest.approx(0.005)
+    assert stage.steps == 30_000 and stage.densify.until == 15_000
+    assert stage.losses["depth"].weight_at(1, 30_000) == pytest.approx(0.5, rel=1e-3)
+    assert stage.losses["depth"].weight_at(30_000, 30_000) == pytest.approx(0.005)
     assert stage.losses["normal"].weight == 0.0125 and stage.regularizers["large"].weight == 0.1
     assert (stage.densify.area, stage.densify.crowd) == (20, 10)
+    later = [refine.stage for refine in surfkit_metrogs.METROGS.refine]
+    assert sum(one.steps for one in later) == 30_000 and not any(one.policies for one in later)
+    for one in later:
+        assert one.losses["normal"].weight == 0.0125 and {one.losses["depth"].weight_at(at, 9) for at in (1, 9)} == {
+            2.5
+        }
+        assert not one.regularizers
+    rates = [each for one in (stage, *later) for each in (one.rates["means"].start, one.rates["means"].end)]
+    assert rates[0] == pytest.approx(1.6e-4) and rates[-1] == pytest.approx(1.6e-6)
+    assert rates[1:-1:2] == pytest.approx(rates[2::2]), "positions go on at the rate that they had"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from surfkit.core.registry import Component
+from surfkit.depth.base import DepthEstimator
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.model import SplatModel
@@ -52,6 +53,12 @@ class Refine(Component):
     def meshers(self) -> tuple[Mesher, ...]:
         """What it makes meshes with; before anything is trained they are asked whether they can work."""
         return ()
+
+    @property
+    def estimator(self) -> DepthEstimator | None:
+        """What makes the depth maps that its losses look at, from the depth that the model before draws; None for those
+        of the run."""
+        return None
 
     def views(self, views: Sequence[View], seed: int) -> tuple[View, ...]:
         """The cameras to look from, given those of the training photographs: all of them, unless it is taught.

@@ -1,0 +1,154 @@
+"""Training that goes on with depth maps which begin at what the model draws."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from needs import needs_native
+
+from surfkit.core.check import BadInput
+from surfkit.core.tree import evolve
+from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.depth.filled import Filled
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.depth_map_index import read_made
+from surfkit.losses.depth import DepthRegression
+from surfkit.raster.select import select
+from surfkit.runs.blocks.train_blocks import Compute
+from surfkit.runs.folder import Run
+from surfkit.runs.pipeline import load_run, run
+from surfkit.runs.recipe import Recipe
+from surfkit.runs.run_cache import part_keys
+from surfkit.runs.run_stage import Intervals, drawing
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train.data_cache import CacheSettings
+from surfkit.train.refine import PruneAndRecover
+from surfkit.train.refine.rendered_depth import RenderedDepth
+from surfkit.train.stage import Stage
+
+pytestmark = needs_native
+QUICK = PatchMatch(coarsest=32, window=3, passes=1, rounds=1, neighbours=3)
+DEPTH = Stage().losses | {"depth": DepthRegression(start=2.5, end=2.5)}
+REFINED = RenderedDepth(depth=QUICK, stage=Stage(steps=4, losses=DEPTH, densify=None))
+EVERY = Intervals(checkpoint=2, pictures=0)
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "farm"
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=48, height=36, points=300)), tracks=True)
+    return Data(folder)
+
+
+@pytest.fixture
+def recipe():
+    plain = Recipe(pretrain=Stage(steps=6, densify=None), refine=(REFINED,))
+    return evolve(plain, "primitive.sh_degree", 0)
+
+
+def watched(monkeypatch):
+    """What stereo was given to begin with, by the name of the view."""
+    seen, match = {}, PatchMatch.estimate
+
+    def estimate(self, given, wanted):
+        for at in wanted:
+            view = given.views[at]
+            seen[view.name] = given.known.see(at, self.of_map(view.camera)), view
+        yield from match(self, given, wanted)
+
+    monkeypatch.setattr(PatchMatch, "estimate", estimate)
+    return seen
+
+
+def test_stereo_begins_at_what_the_model_draws_and_the_stage_learns_from_its_maps(
+    farm, recipe, tmp_path, own_cache, monkeypatch
+):
+    seen = watched(monkeypatch)
+    metrics = run(recipe, farm, tmp_path, Compute("cpu"), EVERY)
+    (folder,) = (own_cache / "depth").iterdir()
+    made = read_made(folder)
+    assert made.maps == len(seen) == 7, "of the training photographs; no others were made for the run"
+    loaded, _, scene = load_run(tmp_path)
+    assert not loaded.wants_priors and loaded.data.priors is None
+    before = checkpoint.load_last(tmp_path / "pretrain" / "checkpoint.safetensors")[0]
+    draw = drawing(loaded.stages[0], before, select("cpu")[0])
+    for known, view in seen.values():
+        maps = draw(view)
+        there = maps.median > 0
+        assert there.any()
+        torch.testing.assert_close(known.inverse[there] * maps.median[there], torch.ones(int(there.sum())))
+        assert not known.inverse[~there].any()
+        length = known.normal.norm(dim=0)[maps.alpha > 0.5]
+        torch.testing.assert_close(length, torch.ones_like(length))
+    events = (tmp_path / "refine0" / "events.jsonl").read_text().splitlines()
+    steps = [event for event in map(json.loads, events) if event["event"] == "StepDone"]
+    assert len(steps) == 4 and any(step["losses"].get("depth", 0) > 0 for step in steps)
+    after = checkpoint.load_last(tmp_path / "refine0" / "checkpoint.safetensors")[0]
+    assert metrics["cpu_seconds"] == after.cpu_seconds > before.cpu_seconds + made.cpu_seconds, "maps count"
+
+
+def test_interrupted_in_every_part_and_gone_on_with(farm, recipe, tmp_path, own_cache, monkeypatch):
+    """To the same bits, with maps that are made once."""
+    run(recipe, farm, tmp_path / "whole", Compute("cpu"), EVERY)
+    for path in (own_cache / "depth").iterdir():
+        path.rename(tmp_path / "other")
+    estimate, save, made = PatchMatch.estimate, checkpoint.save, []
+
+    def stopping(self, given, wanted):
+        for found in estimate(self, given, wanted):
+            if len(made) == 3:
+                made.append(None)
+                raise KeyboardInterrupt
+            made.append(found.at)
+            yield found
+
+    def stop(path, state):
+        save(path, state)
+        if path.parent.name == "refine0" and state.index == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(PatchMatch, "estimate", stopping)
+    monkeypatch.setattr(checkpoint, "save", stop)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, farm, tmp_path / "out", Compute("cpu"), EVERY)
+    monkeypatch.setattr(checkpoint, "save", save)
+    run(recipe, farm, tmp_path / "out", Compute("cpu"), EVERY)
+    assert sorted(at for at in made if at is not None) == list(range(7))
+    assert (tmp_path / "out/point_cloud.ply").read_bytes() == (tmp_path / "whole/point_cloud.ply").read_bytes()
+
+
+def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_path, own_cache):
+    twice = replace(recipe, refine=(REFINED, replace(REFINED, depth=Filled(stereo=QUICK))))
+    run(twice, farm, tmp_path, Compute("cpu"), EVERY)
+    assert [read_made(folder).maps for folder in (own_cache / "depth").iterdir()] == [7, 7]
+
+
+def test_maps_may_not_be_made(farm, recipe, tmp_path):
+    with pytest.raises(BadInput, match=r"refine\.0: it makes depth maps; leave out --no-prepare"):
+        run(recipe, farm, tmp_path, Compute("cpu"), EVERY, CacheSettings(maps=None))
+
+
+@pytest.mark.parametrize("wrong", [{"depth": PlaneSweep()}, {"depth": DepthAnythingV2()}, {"stage": Stage()}])
+def test_what_cannot_begin_or_would_be_in_vain_is_refused(wrong):
+    with pytest.raises(BadInput, match="rendered-depth"):
+        RenderedDepth(**wrong)
+
+
+def test_the_maps_of_a_run_are_another_thing(farm, recipe, tmp_path):
+    """A run wants some only if another part looks at them; what is shared depends on how its own are made."""
+    for refine, wants in ((REFINED, False), (PruneAndRecover(stage=REFINED.stage), True)):
+        assert Run(tmp_path, replace(recipe, refine=(refine,)), farm).wants_priors == wants
+    keys = [
+        part_keys(replace(recipe, refine=(one,), depth=depth))["refine0"]
+        for one, depth in (
+            (REFINED, None),
+            (REFINED, PlaneSweep()),
+            (replace(REFINED, depth=replace(QUICK, rounds=2)), None),
+        )
+    ]
+    assert keys[0] == keys[1] != keys[2]
