@@ -13,6 +13,12 @@ from surfkit.core.optional import needed
 RASTERS = (".tif", ".tiff", ".vrt", ".asc")
 MAX_CELLS = 16_000_000
 """Of a raster: a larger one is read coarser. A cell takes 50 bytes."""
+UNIT_METRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(("us-ft", "us ft", "ft us", "ftus", "us survey foot", "us survey feet", "foot_us"), 1200 / 3937),
+}
+"""Metres per unit of heights that a raster names."""
 PICTURE_BANDS = 3
 """A raster of so many bands or more is a picture."""
 
@@ -23,6 +29,14 @@ def raster_system(path: Path) -> str | None:
         import rasterio
     with rasterio.open(path) as file:
         return file.crs.to_string() if file.crs else None
+
+
+def raster_unit(path: Path) -> float | None:
+    """Metres per unit of the heights of a raster, if it names a unit that is known here."""
+    with needed("rasterio", str(path)):
+        import rasterio
+    with rasterio.open(path) as file:
+        return UNIT_METRES.get((file.units[0] or "").strip().lower())
 
 
 def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:

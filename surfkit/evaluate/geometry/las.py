@@ -109,7 +109,8 @@ def _points(file: Any, most: int) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _notes(path: Path, header: Any) -> dict[str, str]:
-    """Reference system and unit, where the header has a projected one, as well-known text or as keys of GeoTIFF."""
+    """Reference system in plan, its unit, and the system with what heights are above, where the header has a projected
+    one, as well-known text or as keys of GeoTIFF."""
     if not {type(vlr).__name__ for vlr in (*header.vlrs, *(header.evlrs or ()))} & RECORDS:
         return {}
     try:
@@ -121,4 +122,14 @@ def _notes(path: Path, header: Any) -> dict[str, str]:
     except Exception as error:  # what pyproj does not know
         emit(Warned(f"{path}: coordinates are used without their reference system: {' '.join(str(error).split())}"))
         return {}
-    return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and flat.is_projected else {}
+    if not (number and flat.is_projected):
+        return {}
+    return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}", "system": _with_heights(found, number)}
+
+
+def _with_heights(crs: Any, number: int) -> str:
+    """A system of pyproj as text: by its numbers of EPSG where heights have one, and by well-known text otherwise."""
+    if len(crs.axis_info) < 3:
+        return f"EPSG:{number}"
+    heights = crs.sub_crs_list[1].to_epsg() if crs.is_compound else None
+    return f"EPSG:{number}+{heights}" if heights else crs.to_wkt()
