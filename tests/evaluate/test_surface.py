@@ -223,11 +223,31 @@ def test_laser_scans_are_clouds(tmp_path, name, warned, monkeypatch):
     assert len(warned) == 1 and "667 of 2,000 points are used" in warned[0]
 
 
+@pytest.mark.parametrize("version, kind", [("1.2", 3), ("1.4", 6)])
+def test_noise_and_withheld_points_of_a_scan_are_no_surface(tmp_path, version, kind, warned):
+    laspy = needs("laspy")
+    made = laspy.LasData(laspy.LasHeader(version=version, point_format=kind))
+    made.header.scales, made.header.offsets = [1e-3] * 3, PLACES.min(0)
+    made.x, made.y, made.z = PLACES.T
+    made.classification = np.where(np.arange(len(PLACES)) % 10 == 3, 7, 2)
+    made.withheld = np.arange(len(PLACES)) % 10 == 4
+    if kind == 6:
+        made.classification[5::10] = 18
+    made.write(tmp_path / "a.las")
+    good = ~np.isin(np.arange(len(PLACES)) % 10, (3, 4, 5) if kind == 6 else (3, 4))
+    found = read_surface(tmp_path / "a.las").vertices()
+    assert found.shape == PLACES[good].shape and np.abs(found - PLACES[good]).max() < 1e-3
+    assert len(warned) == 1 and f"{(~good).sum()} points are left out, which the file calls noise" in warned[0]
+
+
 def test_a_file_that_is_no_scan_is_refused(tmp_path):
     needs("laspy")
     (tmp_path / "a.las").write_bytes(b"LASF, but no more")
-    with pytest.raises(BadInput, match="a.las: cannot be read"):
-        read_surface(tmp_path / "a.las")
+    (tmp_path / "a.tif").write_bytes(b"II*, but no more")
+    for name in ("a.las", "a.tif"):
+        for use in (read_surface, system_of):
+            with pytest.raises(BadInput, match=f"{name}: cannot be read"):
+                use(tmp_path / name)
     (tmp_path / "a.e57").write_bytes(b"hello")
     with pytest.raises(BadInput, match="a.e57"):  # without pye57 that names the package
         read_surface(tmp_path / "a.e57")
