@@ -241,6 +241,10 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
         ("EPSG:32633\n1 2 3 4 x a.jpg", "line 2"),
         ("EPSG:32633\n1 2 nan 4 5 a.jpg", "not finite"),
         ("EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 9 4 5 1.jpg P", "puts 'P' elsewhere"),
+        (
+            "EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 3 4 5 0.jpg P\n1 2 3 4 7 0.jpg P",
+            "line 4 marks 'P' in '0.jpg' at 4 7, and a line before at 4 5; keep",
+        ),
         ("EPSG:32633\n1 2 3 4 5 a.jpg", "none .*in the folder: 'a.jpg'"),
         ("EPSG:32633", "no points"),
         ("EPSG:32633\n1 2 3 4 500 0.jpg P", "'P' .*4 500 .*'0.jpg', .*400 x 400"),
