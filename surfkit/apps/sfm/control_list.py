@@ -139,6 +139,8 @@ def read_ground(
                 "latitude, or line 1 names another system, such as EPSG:32633"
             )
         positions = system.positions(xyz)
+        if wanted == "auto" and system.lost_heights:
+            emit(Warned(f"--gcp {path}: {system.lost_heights}"))
         chart = chart_of(positions, wanted)
         onto = to_chart(chart, positions)
         if not np.isfinite(onto).all():

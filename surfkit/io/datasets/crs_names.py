@@ -54,6 +54,18 @@ class System:
             return 1.0 if self.degrees else float(axes[0].unit_conversion_factor)
         return float(axes[2].unit_conversion_factor)
 
+    @property
+    def lost_heights(self) -> str:
+        """What is to be said of a system in degrees that says what heights are above, as a scene in UTM does not; ""
+        where nothing is lost."""
+        if not self.degrees or self.crs == WGS84_DEGREES or not (given := CRS(self.crs)).is_compound:
+            return ""
+        name = given.sub_crs_list[1].name
+        return (
+            f"its heights are above {name}, which the zone of UTM that the scene is in does not say; for maps and "
+            "tiles to say it, name the zone and its heights with --crs, such as EPSG:32633+5773 for EGM96"
+        )
+
     def positions(self, xyz: np.ndarray) -> np.ndarray:
         """(P, 3) latitudes and longitudes, degrees on WGS 84, and heights, metres, of (P, 3) coordinates.
 

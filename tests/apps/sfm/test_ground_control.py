@@ -108,6 +108,12 @@ def test_degrees_come_to_utm(tmp_path):
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
     ground = read_ground(tmp_path / "gcp_list.txt", "auto", SIZES)
     np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:4326+3855", *lines[1:]]))
+    for wanted in ("auto", "EPSG:32633+3855"):
+        with collect_notes() as notes:
+            ground = read_ground(tmp_path / "gcp_list.txt", wanted, SIZES)
+        np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+        assert any("above EGM2008 height, which the zone of UTM" in text for text in notes.texts) == (wanted == "auto")
     with pytest.raises(BadInput, match="'P0', 'P1', 'P2' and 6 more .*line 1, 'EPSG:4326'"):
         read_ground(written(tmp_path / "gcp_list.txt", "EPSG:4326"), "auto", SIZES)
 
