@@ -12,6 +12,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry import surface_file as surface
 from surfkit.evaluate.geometry.file_transform import same_plan
+from surfkit.evaluate.geometry.height_systems import HeightSystem
 from surfkit.evaluate.geometry.las import read_las
 from surfkit.evaluate.geometry.sampling import face_areas
 from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface, system_of
@@ -222,11 +223,31 @@ def test_laser_scans_are_clouds(tmp_path, name, warned, monkeypatch):
     assert len(warned) == 1 and "667 of 2,000 points are used" in warned[0]
 
 
+@pytest.mark.parametrize("version, kind", [("1.2", 3), ("1.4", 6)])
+def test_noise_and_withheld_points_of_a_scan_are_no_surface(tmp_path, version, kind, warned):
+    laspy = needs("laspy")
+    made = laspy.LasData(laspy.LasHeader(version=version, point_format=kind))
+    made.header.scales, made.header.offsets = [1e-3] * 3, PLACES.min(0)
+    made.x, made.y, made.z = PLACES.T
+    made.classification = np.where(np.arange(len(PLACES)) % 10 == 3, 7, 2)
+    made.withheld = np.arange(len(PLACES)) % 10 == 4
+    if kind == 6:
+        made.classification[5::10] = 18
+    made.write(tmp_path / "a.las")
+    good = ~np.isin(np.arange(len(PLACES)) % 10, (3, 4, 5) if kind == 6 else (3, 4))
+    found = read_surface(tmp_path / "a.las").vertices()
+    assert found.shape == PLACES[good].shape and np.abs(found - PLACES[good]).max() < 1e-3
+    assert len(warned) == 1 and f"{(~good).sum()} points are left out, which the file calls noise" in warned[0]
+
+
 def test_a_file_that_is_no_scan_is_refused(tmp_path):
     needs("laspy")
     (tmp_path / "a.las").write_bytes(b"LASF, but no more")
-    with pytest.raises(BadInput, match="a.las: cannot be read"):
-        read_surface(tmp_path / "a.las")
+    (tmp_path / "a.tif").write_bytes(b"II*, but no more")
+    for name in ("a.las", "a.tif"):
+        for use in (read_surface, system_of):
+            with pytest.raises(BadInput, match=f"{name}: cannot be read"):
+                use(tmp_path / name)
     (tmp_path / "a.e57").write_bytes(b"hello")
     with pytest.raises(BadInput, match="a.e57"):  # without pye57 that names the package
         read_surface(tmp_path / "a.e57")
@@ -295,6 +316,48 @@ def test_the_highest_points_of_a_cloud_are_a_surface():
 )
 def test_systems_are_compared_in_plan(one, other, same):
     assert same_plan(one, other) is same
+
+
+@pytest.mark.parametrize(
+    ("system", "unit", "said"),
+    [
+        ("EPSG:32633+5773", "", ""),
+        ("EPSG:25833+7837", "", "above DHHN2016 height, and those here above EGM96 height"),
+        (None, "", ""),
+        ("EPSG:32633", "", "heights here are above EGM96 height, and the other side does not say"),
+        ("EPSG:32633+5773", "US survey foot", "in units of 0.3048006 m, and those here of 1 m"),
+        ("EPSG:32633", "ft", "in units of 0.3048 m, and those here of 1 m"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["laz", "tif"])
+def test_heights_above_something_else_or_in_another_unit_are_told(tmp_path, kind, system, unit, said):
+    path = tmp_path / f"truth.{kind}"
+    if kind == "laz":
+        if unit:
+            pytest.skip("units of heights alone are those of rasters")
+        scan(path, PLACES, system)
+    else:
+        rasterio = needs("rasterio")
+        form = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "float32"}
+        place = rasterio.Affine(1, 0, 500_000.0, 0, -1, 5_800_000.0)
+        with rasterio.open(path, "w", **form, transform=place, crs=system) as file:
+            file.write(np.zeros((4, 4), np.float32), 1)
+            file.units = (unit,)
+    ours, theirs = HeightSystem.of("EPSG:32633+5773"), HeightSystem.of(system_of(path), path)
+    told = ours.contradicts(theirs) or ours.leaves_open(theirs)
+    assert said in told and bool(said) == bool(told) if system else not ours.contradicts(theirs)
+
+
+def test_heights_are_in_the_unit_of_their_map():
+    feet = HeightSystem.of("EPSG:2263")
+    assert feet.metres == pytest.approx(1200 / 3937) and not feet.datum
+    assert not feet.contradicts(HeightSystem.of("EPSG:2263+6360")) and "sea level" in feet.leaves_open(
+        HeightSystem.of("EPSG:2263+6360")
+    )
+    assert "in units of 1 m" in feet.contradicts(HeightSystem.of("EPSG:2263+5703"))
+    local = "+proj=topocentric +ellps=WGS84 +lat_0=1.0 +lon_0=2.0 +h_0=3.0"
+    assert HeightSystem.of(local) == HeightSystem() == HeightSystem.of(None)
+    assert HeightSystem.of(pyproj.CRS("EPSG:32633").to_3d().to_wkt()).name == "the ellipsoid"
 
 
 def test_a_cloud_has_no_triangles():

@@ -18,7 +18,7 @@ from surfkit.core.registry import name_of, plugins
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_files import DepthFile
 from surfkit.io.datasets.depth_layout import DepthQuery, find_maps
-from surfkit.io.datasets.masks import MASK_MARKS, MASKS_FOLDER, find_masks, with_opacity
+from surfkit.io.datasets.masks import MASKS_FOLDER, find_masks, masked_name, with_opacity
 from surfkit.io.datasets.panoramas import view_names
 from surfkit.io.datasets.pixel_interpretation import PixelInterpretation, decide
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
@@ -157,4 +157,4 @@ def _loose(data: Data, shots: Sequence[RawImage]) -> tuple[Path, ...]:
 
 def _is_mask(path: Path, root: Path) -> bool:
     """Whether a picture is called as masks are."""
-    return path.stem.endswith(MASK_MARKS) or MASKS_FOLDER in path.relative_to(root).parts
+    return bool(masked_name(path.name)) or MASKS_FOLDER in path.relative_to(root).parts

@@ -21,6 +21,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.stages import key_of
 from surfkit.evaluate.geometry.file_transform import same_plan
+from surfkit.evaluate.geometry.height_systems import HeightSystem
 from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_mesh, read_surface, system_of
 from surfkit.evaluate.geometry.top_surface import highest
 from surfkit.io.datasets.depth_prior import prior_files, read_priors
@@ -103,6 +104,7 @@ class MapsCommand:
                     f"--against {against}: its coordinates are in {system}, and those of {self.run_folder} in "
                     f"{frame.crs}; heights can be subtracted in one system only"
                 )
+            _refuse_other_heights(against, system, frame)
             return heights_of(against)
         run = opened(against)
         refuse_no_mesh(run)
@@ -115,6 +117,24 @@ class MapsCommand:
         if frame.crs is None:
             emit(Warned("neither run is georeferenced; their coordinates are taken to be the same"))
         return read_mesh(run.mesh)
+
+
+def _refuse_other_heights(against: Path, system: str | None, frame: Frame) -> None:
+    """BadInput for heights that are above something else, or in another unit; a line where one side does not say what
+    they are above.
+
+    Args:
+        against: A file of heights.
+        system: Coordinate reference system that it names.
+        frame: Of the run.
+    """
+    ours, theirs = HeightSystem.of(frame.crs), HeightSystem.of(system, against)
+    if frame.crs is None:
+        ours = replace(ours, metres=frame.metres)
+    if why := ours.contradicts(theirs):
+        raise BadInput(f"--against {against}: {why}; convert it, for example with gdalwarp or pdal, or leave it out")
+    if frame.crs is not None and (open_ := ours.leaves_open(theirs)):
+        emit(Warned(f"--against {against}: {open_}; they are subtracted as they are"))
 
 
 def stereo_depths(run: Run, scene: Scene, settings: MapSettings) -> StereoDepths | None:

@@ -83,6 +83,12 @@ def read_list(path: Path) -> tuple[str, list[GroundControlPoint]]:
             raise BadInput(
                 f"--gcp {path}: line {at} puts {name!r} elsewhere than a line before; one place for each name"
             )
+        if point.marks.get(photo, (across, down)) != (across, down):
+            before = " ".join(f"{value:g}" for value in point.marks[photo])
+            raise BadInput(
+                f"--gcp {path}: line {at} marks {name!r} in {photo!r} at {across:g} {down:g}, and a line before at "
+                f"{before}; keep the right one, or give each point a name of its own"
+            )
         found[name] = replace(point, marks={**point.marks, photo: (across, down)})
     return rows[0][1], list(found.values())
 
@@ -133,6 +139,8 @@ def read_ground(
                 "latitude, or line 1 names another system, such as EPSG:32633"
             )
         positions = system.positions(xyz)
+        if wanted == "auto" and system.lost_heights:
+            emit(Warned(f"--gcp {path}: {system.lost_heights}"))
         chart = chart_of(positions, wanted)
         onto = to_chart(chart, positions)
         if not np.isfinite(onto).all():

@@ -155,6 +155,11 @@ def heights_named(where: Placement, photos: Sequence[Photo], given: str) -> tupl
             where,
             f"{above}, and --crs {crs} says something else; leave its vertical part out" if says_height else above,
         )
+    if len(zeros) > 1 and None in zeros:
+        return where, (
+            "heights of some photographs are those of a list and of others those in EXIF, which may be counted from "
+            "elsewhere, up to 100 m apart; they are taken as they are; give all of them with --positions"
+        )
     if {"sea level", "ellipsoid"} <= zeros:
         return where, (
             "heights of some photographs are above the ellipsoid (RTK in XMP, or GPSAltitudeRef in EXIF) and of others "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from surfkit.apps.sfm.exif import MAX_ERROR_M, Position
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.crs_names import WGS84_DEGREES, System, names_a_system, system_of
+from surfkit.scene.crs import known_axes
 
 COLUMN_NAMES = {
     "name": "name label image imagename imagefile photo photograph photoname file filename sourcefile camera "
@@ -35,6 +36,14 @@ GEO_TXT_COLUMNS = ("name", "x", "y", "z", "yaw", "pitch", "roll", "sxy", "sz")
 """Columns of geo.txt, and of a table without a header."""
 DEGREE_NAMES = {"longitude", "lon", "long", "lng", "gpslongitude"}
 """Names of x that say degrees."""
+UNIT_METRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "usft", "ftus", "ussurveyfoot", "ussurveyfeet"), 0.3048),
+}
+"""Metres per unit that the name of the column of heights may state, as in `Altitude [ft]`; feet of both kinds differ by
+1 mm in 500 m."""
+STATED_UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
+"""What stands in brackets in the name of a column."""
 COMMENT = re.compile(r"#\s*(?:CoordinateSystem\s*:\s*)?(.*)", re.IGNORECASE)
 """A line that Metashape or a person begins with #; it may name the system, or the columns."""
 CELL_SEPARATORS = "\t;,"
@@ -98,12 +107,13 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
         raise BadInput(f"{said}: no such file") from error
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{said}: cannot be read as text of UTF-8") from error
-    named, rows, degrees = _rows(lines, said)
+    table = _table(lines, said)
+    named, rows = table.system, table.rows
     own = named or next((row.cells["crs"] for row in rows if row.cells.get("crs")), None)
     if own is not None and crs is not None:
         raise BadInput(f"{said}: it names its system itself, {own[:60]!r}; leave --positions-crs out")
     given = crs if crs is not None else named
-    if given is None and degrees:
+    if given is None and table.degrees:
         given = WGS84_DEGREES
     found: dict[str, tuple[PositionRow, System, list[float | None]]] = {}
     systems: dict[str, System] = {}
@@ -118,15 +128,32 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
             where = f"{said}: line {row.at}" if row.cells.get("crs") else said if crs is None else "--positions-crs"
             systems[text] = _system(f"EPSG:{text}" if text.isdigit() else text, where)
         numbers = [_number(row.cells.get(axis), said, row, axis == "z") for axis in "xyz"]
+        if table.height_metres is not None and numbers[2] is not None:
+            numbers[2] *= table.height_metres / systems[text].height_metres
         name = row.cells["name"]
         if name in found and found[name][2] != numbers:
             raise BadInput(f"{said}: lines {found[name][0].at} and {row.at} give two positions for {name!r}; keep one")
         found[name] = (row, systems[text], numbers)
     if not found:
         raise BadInput(f"{said}: no positions; each line is {WANTED}")
+    if table.height_metres is None and any(numbers[2] is not None for _, _, numbers in found.values()):
+        _tell_unit(systems.values(), said)
     positions = _positions(found, said)
     accuracies = {name: sigma for name in positions if (sigma := _accuracy(found[name][0], said)) is not None}
     return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
+
+
+def _tell_unit(systems: Iterable[System], said: str) -> None:
+    """Say that heights are taken in another unit than metres where neither the list nor its system says so."""
+    for system in systems:
+        axes = None if system.degrees else known_axes(system.crs)
+        if axes is not None and axes.height_metres is None and axes.metres != 1:
+            emit(
+                Warned(
+                    f"{said}: {system.crs} has no heights of its own, so those of the list are taken in its unit, "
+                    f"{axes.unit}; where they are in metres, name the column of heights 'z [m]'"
+                )
+            )
 
 
 def _system(text: str, where: str) -> System:
@@ -136,9 +163,26 @@ def _system(text: str, where: str) -> System:
         raise BadInput(f"{where}: {error}") from error
 
 
-def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[PositionRow], bool]:
-    """The system that a line before the positions names, the rows, and whether names of columns say degrees."""
-    system, header, degrees = None, None, False
+@dataclass(frozen=True)
+class PositionTable:
+    """The lines of a file.
+
+    Attributes:
+        system: That a line before the positions names.
+        rows: One for each photograph with a position.
+        degrees: Whether names of columns say degrees.
+        height_metres: Metres per unit of heights that the name of their column states; None where it states none.
+    """
+
+    system: str | None
+    rows: Sequence[PositionRow]
+    degrees: bool
+    height_metres: float | None
+
+
+def _table(lines: Sequence[str], said: str) -> PositionTable:
+    """What the lines of a file say."""
+    system, header, degrees, height_metres = None, None, False, None
     rows: list[PositionRow] = []
     for at, line in enumerate(lines, 1):
         text = line.strip()
@@ -151,6 +195,7 @@ def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[PositionRow
             continue
         if not rows and header is None and (columns := _header(plain)) is not None:
             header, degrees = columns, any(_small(cell) in DEGREE_NAMES for cell in _split(plain))
+            height_metres = _stated_metres(plain, columns)
             continue
         if comment:
             continue
@@ -169,7 +214,7 @@ def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[PositionRow
         if not row.cells.get("name"):
             raise BadInput(f"{said}: line {at} is {text[:60]!r}, not {WANTED}")
         rows.append(row)
-    return system, rows, degrees
+    return PositionTable(system, rows, degrees, height_metres)
 
 
 def _plain(cells: Sequence[str]) -> list[str]:
@@ -185,6 +230,13 @@ def _header(text: str) -> list[str] | None:
         column = MEANINGS.get(_small(cell), "")
         found.append("" if column in found else column)
     return found if {"name", "x", "y"} <= set(found) else None
+
+
+def _stated_metres(text: str, columns: Sequence[str]) -> float | None:
+    """Metres per unit of heights that a line of names of columns states."""
+    name = next((cell for cell, column in zip(_split(text), columns, strict=True) if column == "z"), "")
+    stated = STATED_UNIT.search(name)
+    return UNIT_METRES.get(re.sub(r"[^a-z]", "", stated[1].lower())) if stated else None
 
 
 def _small(cell: str) -> str:

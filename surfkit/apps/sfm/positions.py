@@ -108,6 +108,8 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
     rest += f": {few(others)}" if others else ""
     instead = f", instead of those in EXIF of {own}" if own else ""
     emit(Warned(f"{said} gives the positions of {len(found.positions)} photographs in {found.named}{instead}{rest}"))
+    if settings.crs == "auto" and (lost := next(filter(None, (each.lost_heights for each in found.systems)), "")):
+        emit(Warned(f"{said}: {lost}"))
     listed = [_listed(photo, found) for photo in photos]
     away = [
         _distance(before.exif.position, after.exif.position)

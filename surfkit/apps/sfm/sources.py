@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from surfkit.apps.sfm.settings import Settings
 from surfkit.apps.sfm.video_frames import ExtractedFrames, take_frames
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.io.datasets.masks import MASK_SUFFIXES, check_mask, find_masks, read_mask
+from surfkit.io.datasets.masks import MASK_SUFFIXES, check_mask, find_masks, masked_name, read_mask
 from surfkit.io.datasets.masks import MASKS_FOLDER as MASKS
 from surfkit.io.datasets.raw_dataset import RawImage
 from surfkit.scene.photo_names import PICTURE_SUFFIXES, is_video
@@ -79,7 +79,18 @@ def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tu
     if inside := [photo.name for photo in photos if MASKS in photo.name.lower().split("/")[:-1]]:
         said = f"{len(inside)} files in folders called {MASKS} are taken for photographs: {few(inside)}"
         emit(Warned(f"{said}; if they are masks, give --masks FOLDER"))
+    if beside := _called_as_masks([photo.name for photo in photos]):
+        said = f"{len(beside)} files are called as masks of the photographs beside them, and taken for photographs"
+        emit(Warned(f"{said}: {few(beside)}; if they are masks, move them to a folder and give --masks FOLDER"))
     return sources, photos
+
+
+def _called_as_masks(names: Sequence[str]) -> list[str]:
+    """Those that are called as the mask of another one in the same folder is."""
+    small = [PurePosixPath(name.lower()) for name in names]
+    known = {*small, *(path.with_suffix("") for path in small)}
+    found = [(name, path, masked_name(path.name)) for name, path in zip(names, small, strict=True)]
+    return [name for name, path, of in found if of and path.with_name(of) in known]
 
 
 def _taken(root: Path, folder: Path, settings: Settings) -> dict[str, ExtractedFrames]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,16 +16,38 @@ from surfkit.core.optional import needed
 RASTERS = (".tif", ".tiff", ".vrt", ".asc")
 MAX_CELLS = 16_000_000
 """Of a raster: a larger one is read coarser. A cell takes 50 bytes."""
+UNIT_METRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(("us-ft", "us ft", "ft us", "ftus", "us survey foot", "us survey feet", "foot_us"), 1200 / 3937),
+}
+"""Metres per unit of heights that a raster names."""
 PICTURE_BANDS = 3
 """A raster of so many bands or more is a picture."""
 
 
 def raster_system(path: Path) -> str | None:
     """The coordinate reference system of a raster, such as EPSG:32632; None where it has none."""
+    with _opened(path) as file:
+        return file.crs.to_string() if file.crs else None
+
+
+def raster_unit(path: Path) -> float | None:
+    """Metres per unit of the heights of a raster, if it names a unit that is known here."""
+    with _opened(path) as file:
+        return UNIT_METRES.get((file.units[0] or "").strip().lower())
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The open raster, of rasterio; BadInput where it is none."""
     with needed("rasterio", str(path)):
         import rasterio
-    with rasterio.open(path) as file:
-        return file.crs.to_string() if file.crs else None
+    try:
+        with rasterio.open(path) as file:
+            yield file
+    except rasterio.errors.RasterioError as error:
+        raise BadInput(f"{path}: cannot be read as a raster: {' '.join(str(error).split())}") from error
 
 
 def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -34,19 +59,14 @@ def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         BadInput: rasterio is not installed, no raster, a picture, without a place, or without heights.
     """
-    with needed("rasterio", str(path)):
-        import rasterio
-    try:
-        with rasterio.open(path) as file:
-            if file.count >= PICTURE_BANDS:
-                raise BadInput(f"{path}: a picture of {file.count} bands; name a raster of heights, which has one")
-            every = max(1, int(np.ceil(np.sqrt(file.width * file.height / MAX_CELLS))))
-            shape = (-(-file.height // every), -(-file.width // every))
-            heights = file.read(1, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
-            heights = heights * file.scales[0] + file.offsets[0]
-            transform, (wide, high) = file.transform, (file.width / shape[1], file.height / shape[0])
-    except rasterio.errors.RasterioError as error:
-        raise BadInput(f"{path}: cannot be read as a raster: {' '.join(str(error).split())}") from error
+    with _opened(path) as file:
+        if file.count >= PICTURE_BANDS:
+            raise BadInput(f"{path}: a picture of {file.count} bands; name a raster of heights, which has one")
+        every = max(1, int(np.ceil(np.sqrt(file.width * file.height / MAX_CELLS))))
+        shape = (-(-file.height // every), -(-file.width // every))
+        heights = file.read(1, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
+        heights = heights * file.scales[0] + file.offsets[0]
+        transform, (wide, high) = file.transform, (file.width / shape[1], file.height / shape[0])
     if transform.is_identity:
         raise BadInput(f"{path}: it does not say where it lies; write it as a GeoTIFF with its place")
     if every > 1:

@@ -22,6 +22,7 @@ from surfkit.evaluate.geometry.errors import (
     write_row,
 )
 from surfkit.evaluate.geometry.file_transform import same_plan
+from surfkit.evaluate.geometry.height_systems import HeightSystem
 from surfkit.evaluate.geometry.line_plot import write_chart
 from surfkit.evaluate.geometry.normal_fidelity import normal_angles, roughness_on_truth
 from surfkit.evaluate.geometry.repetition import RepetitionResult
@@ -88,10 +89,15 @@ def measure_geometry(
 
 
 def warn_of_other_system(truth: Path, frame: Frame) -> None:
-    """Warn if the truth names another coordinate reference system than the photographs; heights do not count."""
+    """Warn if the truth names another coordinate reference system than the photographs, in plan or of heights."""
     theirs = system_of(truth)
-    if theirs is not None and frame.crs is not None and not same_plan(theirs, frame.crs):
+    if frame.crs is None:
+        return
+    if theirs is not None and not same_plan(theirs, frame.crs):
         emit(Warned(f"{truth}: its coordinates are in {theirs}, and those of the photographs in {frame.crs}"))
+    ours, heights = HeightSystem.of(frame.crs), HeightSystem.of(theirs, truth)
+    if why := ours.contradicts(heights) or ours.leaves_open(heights):
+        emit(Warned(f"{truth}: {why} (here: the photographs)"))
 
 
 def figures(outcome: ComparisonResult, settings: Comparison) -> dict[str, Any]:

@@ -70,12 +70,12 @@ class SurfaceFile:
 
 
 def system_of(path: Path) -> str | None:
-    """The coordinate reference system that a LAS file, a raster of heights or a PLY file of surfkit names; None where
-    there is none."""
+    """The coordinate reference system that a LAS file, a raster of heights or a PLY file of surfkit names, with what
+    heights are above if it says so; None where there is none."""
     if path.suffix.lower() == ".ply":
         return notes_in("\n".join(_header(path))).get("crs")
     if path.suffix.lower() in CLOUDS:
-        return las_notes(path).get("crs")
+        return las_notes(path).get("system")
     return raster_system(path) if path.suffix.lower() in RASTERS else None
 
 

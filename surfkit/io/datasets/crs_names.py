@@ -43,6 +43,29 @@ class System:
     crs: str
     degrees: bool
 
+    @property
+    def height_metres(self) -> float:
+        """Metres per unit of heights: where a map has no heights of its own, they are in its unit, as those of control
+        points and of scenes on it are."""
+        if self.crs == WGS84_DEGREES or zone_of(self.crs):
+            return 1.0
+        axes = CRS(self.crs).axis_info
+        if len(axes) < 3:
+            return 1.0 if self.degrees else float(axes[0].unit_conversion_factor)
+        return float(axes[2].unit_conversion_factor)
+
+    @property
+    def lost_heights(self) -> str:
+        """What is to be said of a system in degrees that says what heights are above, as a scene in UTM does not; ""
+        where nothing is lost."""
+        if not self.degrees or self.crs == WGS84_DEGREES or not (given := CRS(self.crs)).is_compound:
+            return ""
+        name = given.sub_crs_list[1].name
+        return (
+            f"its heights are above {name}, which the zone of UTM that the scene is in does not say; for maps and "
+            "tiles to say it, name the zone and its heights with --crs, such as EPSG:32633+5773 for EGM96"
+        )
+
     def positions(self, xyz: np.ndarray) -> np.ndarray:
         """(P, 3) latitudes and longitudes, degrees on WGS 84, and heights, metres, of (P, 3) coordinates.
 
@@ -64,8 +87,7 @@ class System:
             )
             known = Transformer.from_crs(given.to_2d(), WGS84_DEGREES, always_xy=True)
         flat = known.transform(xyz[:, 0], xyz[:, 1])
-        metres = float(given.axis_info[2].unit_conversion_factor) if len(given.axis_info) > 2 else 1.0
-        return np.column_stack([flat[1], flat[0], xyz[:, 2] * metres])
+        return np.column_stack([flat[1], flat[0], xyz[:, 2] * self.height_metres])
 
 
 def names_a_system(text: str) -> bool:

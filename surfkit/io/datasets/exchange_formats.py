@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import PurePosixPath
 from urllib.parse import unquote
 
+from pyproj import CRS
+
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.datasets.camera_files import numbers
@@ -48,15 +50,16 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
     if text.upper().startswith("EPSG:"):
         flat, _, up = text.upper().replace(" ", "").partition("+")
         if up:
-            emit(Warned(f"{where}: heights are those of {up}; what is written names {flat} alone"))
+            _tell_heights(where, up, flat)
         try:
             return flat, axes_of(flat).metres
         except BadInput as error:
             raise BadInput(f"{where}: {error}; or export in local coordinates") from error
     if "[" in text:
-        given = in_plan(from_wkt(where, text))
+        whole = from_wkt(where, text)
+        given = in_plan(whole)
         if given.is_projected:
-            return code_in(given) or text, metres_of(given)
+            return code_in_plan(where, whole) or text, metres_of(given)
         if not given.is_engineering:
             raise BadInput(degrees)
         return None, metres_of(given) if UNIT_PATTERN.search(text) else None
@@ -65,3 +68,17 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
     if "local" not in text.lower():
         emit(Warned(f"{where} is not understood: coordinates are those of the file"))
     return None, None
+
+
+def code_in_plan(where: str, crs: CRS) -> str | None:
+    """The code that the text of a system has for easting and northing; None where it has none. A line says that what is
+    written leaves out what heights are above, where the text says that."""
+    flat = in_plan(crs)
+    code = code_in(flat)
+    if code is not None and crs.is_compound:
+        _tell_heights(where, repr(crs.sub_crs_list[1].name), code)
+    return code
+
+
+def _tell_heights(where: str, up: str, flat: str) -> None:
+    emit(Warned(f"{where}: heights are those of {up}; what is written names {flat} alone"))

@@ -36,7 +36,8 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[RawImage]) -> di
     """The mask of each photograph that has one, by name.
 
     Masks are those that the data set names; `masks/NAME.png` or `masks/STEM.png` with the folders of the photograph or
-    without, in any folder called masks; or STEM_mask.png and STEM.mask.png, there or beside the photograph.
+    without, in any folder called masks; or STEM_mask.png and STEM.mask.png, there or beside the photograph, in capitals
+    or not, and with the ending of any picture.
 
     Whether alpha channels or colours count is decided for all of them together: alone, a cut-out that is opaque
     throughout looks like a mask by its colours, which are black as often as not.
@@ -49,12 +50,12 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[RawImage]) -> di
     Raises:
         BadInput: The folder or a mask that the data set names is not there.
     """
-    known = _index(_folders(root, folder))
+    known, beside = _index(_folders(root, folder)), _beside(shots)
     found = {}
     for shot in shots:
         if shot.mask is not None and not shot.mask.is_file():
             reject(BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}"))
-        elif mask := shot.mask or _of(shot, known):
+        elif mask := shot.mask or _of(shot, known, beside):
             found[shot.name] = mask
     cut_out, clear = _cut_out(list(dict.fromkeys(found.values())))
     masks = {name: Mask(path, path in cut_out) for name, path in found.items()}
@@ -281,14 +282,30 @@ def _index(folders: Sequence[Path]) -> dict[str, set[Path]]:
     return known
 
 
-def _of(shot: RawImage, known: dict[str, set[Path]]) -> Path | None:
+def _beside(shots: Sequence[RawImage]) -> dict[Path, Path]:
+    """Masks in the folders of photographs, by the path without ending and mark, the name in small letters."""
+    photos, found = {shot.path for shot in shots}, {}
+    for folder in sorted({path.parent for path in photos}):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if path not in photos and path.suffix.lower() in MASK_SUFFIXES and (name := masked_name(path.name)):
+                found.setdefault(path.with_name(name), path)
+    return found
+
+
+def masked_name(name: str) -> str:
+    """What a mask is the mask of, by its name, in small letters: "a" or "a.jpg"; "" for what is not called as masks
+    are. OpenDroneMap's are called a_MASK.JPG."""
+    stem = PurePosixPath(name).stem.lower()
+    return next((stem.removesuffix(mark) for mark in MASK_MARKS if stem.endswith(mark)), "")
+
+
+def _of(shot: RawImage, known: dict[str, set[Path]], beside: dict[Path, Path]) -> Path | None:
     """The mask of a photograph, by the first of its names that belongs to one mask only."""
     for name in _names(shot):
         if len(masks := known.get(name.lower(), ())) == 1:
             return next(iter(masks))
-    stem = shot.path.with_suffix("").name
-    beside = (shot.path.with_name(f"{start}{mark}.png") for mark in MASK_MARKS for start in (stem, shot.path.name))
-    return next((path for path in beside if path.is_file()), None)
+    own = (shot.path.with_suffix("").name, shot.path.name)
+    return next((mask for name in own if (mask := beside.get(shot.path.with_name(name.lower())))), None)
 
 
 def _names(shot: RawImage) -> Iterator[str]:

@@ -19,9 +19,10 @@ from surfkit.io.datasets.base import Reader
 from surfkit.io.datasets.brown import Brown, LensTable
 from surfkit.io.datasets.camera_files import numbers, one_file, photographs, pose_at, read_text
 from surfkit.io.datasets.data import Data
+from surfkit.io.datasets.exchange_formats import code_in_plan
 from surfkit.io.datasets.raw_dataset import RawDataset, RawImage
 from surfkit.io.datasets.transforms import points
-from surfkit.scene.crs import code_in, from_wkt, in_plan, metres_of
+from surfkit.scene.crs import from_wkt, in_plan, metres_of
 
 PARAMETER_FOLDERS = ("", "params", "1_initial/params")
 """Where the files may lie."""
@@ -178,4 +179,4 @@ def _crs(path: Path) -> tuple[str | None, float | None]:
     if not flat.is_projected:
         emit(Warned(f"{path}: {given.name!r} is no projected coordinate reference system, and is left out"))
         return None, None
-    return code_in(flat) or text, metres_of(flat)
+    return code_in_plan(str(path), given) or text, metres_of(flat)

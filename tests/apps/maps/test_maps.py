@@ -1,6 +1,7 @@
 """`surfkit maps`."""
 
 import json
+import re
 import signal
 import sys
 from functools import partial
@@ -11,12 +12,16 @@ from forks import started
 from interrupted import digests, kill_at
 from needs import needs, needs_native
 
+from surfkit.apps.maps.command import MapsCommand
 from surfkit.apps.texture.obj_glb import AtlasPageMesh, write_obj
 from surfkit.cli import main
+from surfkit.core.check import BadInput
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.mesh_export import write_mesh
+from surfkit.runs.run_notes import collect_notes
+from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 rasterio = needs("rasterio")
@@ -89,6 +94,31 @@ def test_heights_of_rasters_and_laser_scans_are_subtracted(run, tmp_path, name):
     found = json.loads((tmp_path / "m/maps.json").read_text())["difference"]
     assert found["area"] > 58 and found["median"] == pytest.approx(0.5, abs=0.03)
     assert found["fill"] / found["area"] == pytest.approx(0.5, abs=0.03) and found["cut"] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("system", "unit", "code", "said"),
+    [
+        ("EPSG:32633+5773", "", 0, "subtracted"),
+        ("EPSG:32633+7837", "", 2, "its heights are above DHHN2016 height, and those here above EGM96 height; convert"),
+        ("EPSG:32633", "", 0, "the other side does not say what its heights are above"),
+        ("EPSG:32633", "ft", 2, "its heights are in units of 0.3048 m, and those here of 1 m"),
+    ],
+)
+def test_heights_above_another_datum_or_in_feet_are_not_subtracted(tmp_path, system, unit, code, said):
+    frame = Frame(np.array([500_000.0, 5_800_000, 0]), 1.0, 1.0, "EPSG:32633+5773")
+    kind = {"driver": "GTiff", "width": 4, "height": 4, "count": 1, "dtype": "float32", "crs": system}
+    with rasterio.open(tmp_path / "a.tif", "w", **kind, transform=rasterio.Affine(1, 0, 5e5, 0, -1, 58e5)) as file:
+        file.write(np.full((4, 4), 7, np.float32), 1)
+        file.units = (unit,)
+    command = MapsCommand(tmp_path / "run")
+    with collect_notes() as notes:
+        if code:
+            with pytest.raises(BadInput, match=re.escape(said)):
+                command._other(tmp_path / "a.tif", frame)
+        else:
+            assert len(command._other(tmp_path / "a.tif", frame)) == 16
+            assert len(notes.texts) == (system == "EPSG:32633") and (not notes.texts or said in notes.texts[0])
 
 
 def test_cells_are_as_large_as_pixels_and_the_cameras_say_what_is_up(run, capsys):

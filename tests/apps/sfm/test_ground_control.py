@@ -108,6 +108,12 @@ def test_degrees_come_to_utm(tmp_path):
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
     ground = read_ground(tmp_path / "gcp_list.txt", "auto", SIZES)
     np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+    (tmp_path / "gcp_list.txt").write_text("\n".join(["EPSG:4326+3855", *lines[1:]]))
+    for wanted in ("auto", "EPSG:32633+3855"):
+        with collect_notes() as notes:
+            ground = read_ground(tmp_path / "gcp_list.txt", wanted, SIZES)
+        np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+        assert any("above EGM2008 height, which the zone of UTM" in text for text in notes.texts) == (wanted == "auto")
     with pytest.raises(BadInput, match="'P0', 'P1', 'P2' and 6 more .*line 1, 'EPSG:4326'"):
         read_ground(written(tmp_path / "gcp_list.txt", "EPSG:4326"), "auto", SIZES)
 
@@ -241,6 +247,10 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
         ("EPSG:32633\n1 2 3 4 x a.jpg", "line 2"),
         ("EPSG:32633\n1 2 nan 4 5 a.jpg", "not finite"),
         ("EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 9 4 5 1.jpg P", "puts 'P' elsewhere"),
+        (
+            "EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 3 4 5 0.jpg P\n1 2 3 4 7 0.jpg P",
+            "line 4 marks 'P' in '0.jpg' at 4 7, and a line before at 4 5; keep",
+        ),
         ("EPSG:32633\n1 2 3 4 5 a.jpg", "none .*in the folder: 'a.jpg'"),
         ("EPSG:32633", "no points"),
         ("EPSG:32633\n1 2 3 4 500 0.jpg P", "'P' .*4 500 .*'0.jpg', .*400 x 400"),

@@ -4,6 +4,7 @@ import numpy as np
 import pyproj
 import pytest
 
+from surfkit.apps.sfm.georeference import chart_of, to_chart
 from surfkit.apps.sfm.position_list import read_list
 from surfkit.core.check import BadInput
 from surfkit.runs.run_notes import collect_notes
@@ -61,6 +62,25 @@ def test_well_known_text_is_left_to_pyproj(listed):
     found = listed(f"#CoordinateSystem: {pyproj.CRS('EPSG:2180').to_wkt('WKT1_GDAL')}\na.jpg,350000,520000,99\n")
     wanted = pyproj.Transformer.from_crs("EPSG:2180", "EPSG:4326", always_xy=True).transform(350000, 520000)
     assert found.positions["a.jpg"] == pytest.approx((wanted[1], wanted[0], 99), abs=1e-9) and found.crs == "EPSG:2180"
+
+
+def test_heights_are_in_the_unit_that_the_list_or_its_system_states(listed):
+    """Of a map in feet without heights of its own they are in feet, as those of control points on it are."""
+    feet = 1200 / 3937
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:2263", always_xy=True).transform(-73.6, 40.75)
+    for crs, unit in (("EPSG:2263", feet), ("EPSG:2263+6360", feet), ("EPSG:2263+5703", 1.0)):
+        with collect_notes() as notes:
+            found = listed(f"{crs}\na.jpg {x} {y} 500\n")
+        assert ("taken in its unit, US survey foot" in "".join(notes.texts)) == (crs == "EPSG:2263")
+        assert found.positions["a.jpg"] == pytest.approx((40.75, -73.6, 500 * unit), abs=1e-6)
+    assert to_chart(
+        chart_of(np.array([found.positions["a.jpg"]]), "EPSG:2263"), np.array([[40.75, -73.6, 500 * feet]])
+    )[0, 2] == pytest.approx(500, abs=1e-6)
+    for unit, metres in (("ft", 0.3048), ("US ft", 0.3048), ("m", 1.0), ("deg", feet)):
+        found = listed(f"name,x,y,z [{unit}]\na.jpg,{x},{y},500\n", "EPSG:2263")
+        assert found.positions["a.jpg"][2] == pytest.approx(500 * metres, rel=1e-5), unit
+        found = listed(f"Image,Latitude,Longitude,Altitude ({unit})\na.jpg,40.75,-73.6,500\n")
+        assert found.positions["a.jpg"][2] == pytest.approx(500 * (1.0 if unit == "deg" else metres)), unit
 
 
 def test_heights_that_are_missing_blanks_in_names_and_accuracies(listed):

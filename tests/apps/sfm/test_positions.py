@@ -124,6 +124,11 @@ def test_a_list_comes_first_then_geo_txt_then_exif(settled, tmp_path):
     path.write_text("label,longitude,latitude,altitude\nB,151.2,-33.9,7\n")
     found, at, said = settled(*photos, settings=Settings(positions=path))
     assert at == [far, (*SOUTH[:2], 7.0), None] and found.crs is None and "geo.txt" not in said
+    assert "heights are above" not in said
+    path.write_text("EPSG:4326+5773\nB,151.2,-33.9,7\n")
+    for crs in ("auto", "EPSG:32756+5773"):
+        _, at, said = settled(*photos, settings=Settings(positions=path, crs=crs))
+        assert at[1] == (*SOUTH[:2], 7.0) and ("heights are above EGM96 height" in said) == (crs == "auto")
 
 
 def test_geo_txt_in_the_folder_above_and_one_of_other_photographs(settled, tmp_path):

@@ -177,7 +177,8 @@ def test_heights_that_count_down_are_found_out_where_they_vary():
         (["ellipsoid"], "EPSG:32756+5773", "EPSG:32756+5773", "says something else; leave its vertical part out"),
         (["ellipsoid", "sea level"], "auto", "EPSG:32756", "up to 100 m apart"),
         ([None], "auto", "EPSG:32756", None),
-        (["sea level", None], "auto", "EPSG:32756", None),
+        (["sea level", None], "auto", "EPSG:32756", "are those of a list and of others those in EXIF"),
+        (["ellipsoid", None], "auto", "EPSG:32756", "are those of a list and of others those in EXIF"),
     ],
 )
 def test_the_system_says_what_heights_are_above_if_photographs_do(zeros, given, crs, said):

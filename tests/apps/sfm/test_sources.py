@@ -64,6 +64,15 @@ def test_no_feature_is_taken_where_a_mask_is_black(folder):
         assert not unmasked.mask
 
 
+def test_masks_beside_photographs_are_told(folder):
+    shutil.copy(folder / "m/2_mask.png", folder / "p/flight/2_MASK.PNG")
+    shutil.copy(folder / "p/flight/4.jpg", folder / "p/flight/9_mask.jpg")
+    with collect_notes() as notes:
+        sources_of(folder)
+    told = [text for text in notes.texts if "called as masks" in text]
+    assert len(told) == 1 and told[0].startswith("1 files") and "flight/2_MASK.PNG" in told[0]
+
+
 def test_a_set_of_cut_outs_is_read_alike_and_masks_that_keep_nothing_are_told(folder):
     alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
     alpha[HIDDEN] = 0

@@ -62,6 +62,8 @@ def scene_of(farm, **settings):
         "images/view_001_mask.png",
         "images/view_001.mask.png",
         "images/view_001.png.mask.png",
+        "images/view_001_MASK.JPG",
+        "images/VIEW_001.PNG_mask.tif",
     ],
 )
 def test_the_habits_of_other_programs(farm, place):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pyproj
 import pytest
 from exchange_files import blocks_exchange, opf, polycam, record3d, xmp_sidecars
 from PIL import Image
@@ -83,6 +84,7 @@ ENU = "+proj=topocentric +ellps=WGS84 +lat_0=39.97523 +lon_0=-83.00678 +h_0=0.0"
     [
         ("EPSG:32632", "EPSG:32632", 1.0),
         ("EPSG:32632+5773", "EPSG:32632", 1.0),
+        (pyproj.CRS("EPSG:32632+5773").to_wkt("WKT1_GDAL"), "EPSG:32632", 1.0),
         ("ENU:39.97523,-83.00678", ENU, 1.0),
         (FEET, FEET, pytest.approx(1200 / 3937, rel=1e-9)),
         (LOCAL_CS, None, 1.0),
@@ -99,7 +101,9 @@ def test_blocks_on_the_map(tmp_path, system, crs, metres):
     poses = [scene.frame.input_pose(view.camera.world_to_camera) for view in scene.train]
     places = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
     np.testing.assert_allclose(places, [ORIGIN + centre for _, centre in POSES.values()], atol=1e-6)
-    assert any("heights are those of 5773" in text for text in kept.texts) == (system == "EPSG:32632+5773")
+    has_heights = system is not None and ("+5773" in system or "COMPD_CS" in system)
+    told = [text for text in kept.texts if "heights are those of" in text]
+    assert len(told) == has_heights and all("5773" in text or "EGM96 height" in text for text in told)
 
 
 @pytest.mark.parametrize(
