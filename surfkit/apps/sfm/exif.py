@@ -225,13 +225,15 @@ def _zero(gps: Mapping[int, Any], camera: Mapping[int, Any], xmp: Mapping[str, f
     """What altitudes are counted from.
 
     References 2 and 3 are the sea level. 0 and 1 were it until EXIF 3.0, which made them the ellipsoid. Drones with RTK
-    write heights above the ellipsoid under the old 0, as there was no other.
+    write heights above the ellipsoid under the old 0, as there was no other; some say so in XMP, as VertCS.
     """
     if ALTITUDE_TAG not in gps and xmp_names.ALTITUDE not in xmp:
         return None
     reference = _reference(gps)
     if reference in SEA_LEVEL_REFERENCES:
         return "sea level"
+    if (stated := xmp.get(xmp_names.ELLIPSOIDAL)) is not None:
+        return "ellipsoid" if stated else "sea level"
     is_new = reference is not None and (_text(camera.get(EXIF_VERSION_TAG)) or "") >= "0300"
     return "ellipsoid" if is_new or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
 

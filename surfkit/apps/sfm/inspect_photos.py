@@ -32,7 +32,7 @@ DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MAX_READER_THREADS = 8
 """Photographs that are read at once."""
-PHOTOGRAPHS_VERSION = 3
+PHOTOGRAPHS_VERSION = 4
 """Changes when more is found in a photograph: it is looked at again then."""
 PANORAMA_PROBLEM = "a panorama"
 """Begins the problem of one."""

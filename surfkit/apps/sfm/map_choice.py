@@ -150,7 +150,7 @@ def heights_named(where: Placement, photos: Sequence[Photo], given: str) -> tupl
             "rule"
         )
     if zeros == {"ellipsoid"}:
-        above = "heights are above the ellipsoid, as RTK (XMP) or GPSAltitudeRef in EXIF say"
+        above = "heights are above the ellipsoid, as RTK or VertCS (XMP) or GPSAltitudeRef in EXIF say"
         return (
             where,
             f"{above}, and --crs {crs} says something else; leave its vertical part out" if says_height else above,

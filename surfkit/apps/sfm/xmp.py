@@ -17,6 +17,13 @@ DRONES = ("drone-dji", "Camera")
 """Prefixes of DJI, and of Pix4D's convention that Parrot, senseFly and others follow: all their numbers are kept."""
 LATITUDE, LONGITUDE, ALTITUDE, ABOVE_START = "latitude", "longitude", "altitude", "above start"
 """Names under which positions are kept, degrees and metres."""
+ELLIPSOIDAL = "ellipsoidal"
+"""Name under which it is kept what `VertCS` of Pix4D's convention says heights are above: 1 the ellipsoid, 0 sea
+level."""
+VERTICAL_SYSTEMS = {
+    **dict.fromkeys(("ellipsoidal", "ellipsoid", "wgs84", "epsg:4979", "epsg:7030"), 1.0),
+    **dict.fromkeys(("orthometric", "egm84", "egm96", "egm2008", "epsg:5798", "epsg:5773", "epsg:3855"), 0.0),
+}
 FIELD_NAMES = {
     "gpslatitude": LATITUDE,
     "gpslongitude": LONGITUDE,
@@ -42,6 +49,8 @@ def read_xmp(packet: bytes | str | None) -> dict[str, float]:
         small = name.lower()
         if prefix in DRONES and (number := _number(value)) is not None:
             found[name] = number
+        if prefix in DRONES and small == "vertcs" and (zero := VERTICAL_SYSTEMS.get(value.lower())) is not None:
+            found[ELLIPSOIDAL] = zero
         what = FIELD_NAMES.get(small) or (DRONE_FIELD_NAMES.get(small) if prefix.startswith("drone") else None)
         if what is None or (what == ALTITUDE and small == "gpsaltitude" and ALTITUDE in found):
             continue

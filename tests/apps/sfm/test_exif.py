@@ -55,6 +55,21 @@ def test_where_altitudes_are_0(reference, version, flag, zero):
     assert facts({}, {}, {exif.ALTITUDE_REF_TAG: b"\0"}, xmp, (40, 30)).zero is None, "no altitude"
 
 
+@pytest.mark.parametrize(
+    ("said", "zero"),
+    [("ellipsoidal", "ellipsoid"), ("EPSG:4979", "ellipsoid"), ("EPSG:5773", "sea level"), ("EGM96", "sea level")]
+    + [("of a town", "ellipsoid")],
+)
+def test_what_pix4d_s_tag_says_of_heights_goes_before_rtk(said, zero):
+    for packet in (f"<Camera:VertCS>{said}</Camera:VertCS>", f"<rdf:Description Camera:VertCS='{said}'/>"):
+        xmp = read_xmp(packet) | {"RtkFlag": 50.0}
+        assert facts({}, {}, {exif.ALTITUDE_TAG: 120.0, exif.ALTITUDE_REF_TAG: b"\0"}, xmp, (40, 30)).zero == zero
+        xmp = read_xmp(packet) | {"altitude": 120.0}
+        wanted = "sea level" if said == "of a town" else zero
+        assert facts({}, {}, {}, xmp, (40, 30)).zero == wanted
+        assert facts({}, {}, {exif.ALTITUDE_TAG: 1.0, exif.ALTITUDE_REF_TAG: b"\2"}, xmp, (40, 30)).zero == "sea level"
+
+
 def test_camera_time_and_orientation(photo):
     basic = {exif.MAKE_TAG: "DJI\0", exif.MODEL_TAG: "FC6310", exif.ORIENTATION_TAG: 6}
     write_exif(photo, basic=basic, camera={exif.TAKEN_TAG: "2024:05:01 12:00:00", exif.SUBSECOND_TAG: "25"})
