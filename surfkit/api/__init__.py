@@ -15,6 +15,7 @@ from surfkit.api.results import Figures, RunMesh
 from surfkit.api.run import TrainedRun, open_run
 from surfkit.api.scene_of_arrays import from_arrays
 from surfkit.api.splats import read_splats, save_splats
+from surfkit.api.torch_state import own_torch_state
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import say
@@ -96,6 +97,7 @@ def train(
     """
     chosen, is_file = get_recipe(recipe), str(recipe).endswith(".json")
     steps, folder, device = fit(int | None, steps, "steps"), fit(Path, out, "out"), str(device)
+    cache = fit(str, cache, "cache")
     given = scene if isinstance(scene, Dataset) else read(scene, test_every=chosen.test_every)
     if steps is None and not is_file and chosen.has_stages and chosen.pretrain.steps == Stage().steps:
         count = len(given.train)
@@ -103,7 +105,7 @@ def train(
         if steps is not None:
             say(f"steps: {steps:,}, as there are {count:,} photographs to train on; steps= changes it")
     chosen = chosen if steps is None else with_steps(chosen, steps)
-    with listening(on_step):
+    with listening(on_step), own_torch_state():
         points = PointsOn(points_on, None if scratch is None else Path(scratch))
         pipeline.run(chosen, given.data, folder, Compute(device), caches=CacheSettings(cache, points=points))
     return open_run(folder, device=device)

@@ -120,8 +120,10 @@ class Dataset:
         """(3, H, W) float32 photograph of a view in [0, 1], at the size of its camera.
 
         Raises:
-            BadInput: It cannot be read.
+            BadInput: It cannot be read, or is no view.
         """
+        if not isinstance(view, View):
+            raise BadInput(f"photo: expected a view of the data set, such as scene.train[0], got {type(view).__name__}")
         size = view.camera.width, view.camera.height
         return read_photo(view.path, size, view.white, view.pixels).float() / 255
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.surface_file import read_surface
+from surfkit.core.fit import fit
+from surfkit.evaluate.geometry.surface_file import metres_in, read_surface, system_of
 from surfkit.mesh.base import VALUES
 from surfkit.mesh.base import Mesh as LocalMesh
 from surfkit.mesh.mesh_export import write_mesh
@@ -27,6 +28,8 @@ class RunMesh:
         colors: (V, 3) uint8; None where the file is no PLY or has none.
         values: Of the vertices, by name: (V,) float32; see `surfkit.mesh.base.VALUES`. None of files that are no PLY.
         path: The file that it was read from.
+        crs: Coordinate reference system of the vertices, such as "EPSG:32632"; None where the file does not say.
+        metres: Metres per unit; None where the file does not say.
     """
 
     vertices: np.ndarray
@@ -34,6 +37,8 @@ class RunMesh:
     colors: np.ndarray | None = None
     values: Mapping[str, np.ndarray] = field(default_factory=dict)
     path: Path | None = None
+    crs: str | None = None
+    metres: float | None = None
 
     @staticmethod
     def read(path: Path) -> RunMesh:
@@ -48,13 +53,20 @@ class RunMesh:
         names = found.rows.dtype.names or ()
         colors = [found.rows[name] for name in ("red", "green", "blue") if name in names]
         values = {name: np.asarray(found.rows[name]) for name in VALUES if name in names}
-        return RunMesh(found.vertices(), found.faces, np.stack(colors, 1) if colors else None, values, path)
+        color = np.stack(colors, 1) if colors else None
+        return RunMesh(found.vertices(), found.faces, color, values, path, system_of(path), metres_in(path))
 
     def save(self, path: str | Path) -> Path:
-        """Write it as .ply, .obj or .glb."""
-        frame = Frame.of_positions(self.vertices)
+        """Write it as .ply, .obj or .glb.
+
+        Raises:
+            BadInput: Another suffix, or no path.
+        """
+        file = fit(Path, path, "save")
+        frame = replace(Frame.of_positions(self.vertices), crs=self.crs, metres=self.metres)
+        frame = replace(frame, origin=np.array(frame.shift))  # float32 would round survey coordinates to half a metre
         local = LocalMesh(frame.to_local(self.vertices).astype(np.float32), self.faces, self.colors, dict(self.values))
-        return write_mesh(Path(path), local, frame)[0]
+        return write_mesh(file, local, frame)[0]
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ import torch
 from surfkit.api.compare_surfaces import Surface, surface_file
 from surfkit.api.dataset import Dataset, view_of
 from surfkit.api.results import Figures, RunMesh
+from surfkit.api.splats import format_of_words, write_told
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.fit import fit, settings_of
 from surfkit.core.lock import locked
-from surfkit.core.registry import components, find
+from surfkit.core.registry import find
 from surfkit.core.tree import evolve
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure_geometry import measure_geometry
@@ -171,7 +172,7 @@ class TrainedRun:
             chosen.ready()
         maker = made.mesh if chosen is None else chosen
         assert maker is not None, "where the method has made no mesh, a mesher does"
-        budget = cache_bytes(memory, "memory")
+        budget = cache_bytes(fit(str, memory, "mesh: memory"), "memory")
         maps = nullcontext(run) if chosen is None else with_maps_to_mesh(run, chosen, scene, ctx.caches, self.device)
         with (
             collect_notes(),
@@ -227,30 +228,20 @@ class TrainedRun:
         Raises:
             BadInput: No such format, or the splats have no place in it.
         """
-        path, (ctx, made) = Path(path), self._loaded
-        form = format if isinstance(format, Format) else find(Format, format)() if format else _format_of(path)
+        file: Path = fit(Path, path, "export")
+        form, (ctx, made) = format_of_words(file, format, "export"), self._loaded
         tree = None
         if form.wants_tree:
             if not ctx.run.lod_record.exists():
                 raise BadInput(
-                    f"{path}: this format takes levels of detail, and there are none; surfkit lod makes them"
+                    f"{file}: this format takes levels of detail, and there are none; surfkit lod makes them"
                 )
             tree = load_levels(ctx.run, splats_of(ctx.run, made)).tiles(ctx.scene.frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        form.write(path, self.splats, ctx.scene.frame, tree)
-        return path
+        write_told(file, form, self.splats, ctx.scene.frame, tree)
+        return file
 
 
 def _mesher(given: str | Mesher | None, default: Mesher) -> Mesher:
     if given is None or isinstance(given, Mesher):
         return given or default
     return find(Mesher, given.removeprefix("mesh:"))()
-
-
-def _format_of(path: Path) -> Format:
-    """The format whose suffix a file has, the longest first."""
-    known = {cls.suffix: cls for cls in components(Format).values() if cls.suffix}
-    for suffix in sorted(known, key=len, reverse=True):
-        if path.name.lower().endswith(suffix):
-            return known[suffix]()
-    raise BadInput(f"{path}: {path.suffix or 'no suffix'} is no format of splats; known: {', '.join(sorted(known))}")

@@ -12,12 +12,14 @@ from torch import Tensor
 
 from surfkit.api.listen import heard
 from surfkit.core.check import BadInput
+from surfkit.core.events import say
 from surfkit.core.fit import fit
-from surfkit.core.registry import find
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.file_axes import AxesOrAuto
+from surfkit.io.splats.page import HtmlPageFormat
 from surfkit.io.splats.splat_files import format_for, read_splat_file
-from surfkit.io.splats.splat_table import SplatTable
+from surfkit.io.splats.splat_table import SplatTable, Tile
+from surfkit.io.splats.tiles3d import Tiles3D
 from surfkit.raster.api import Maps, Render, Splats
 from surfkit.raster.base import Rasterizer
 from surfkit.scene.camera import Camera
@@ -55,7 +57,8 @@ def save_splats(
         splats: Frame of the input.
         path: File; its suffix says the format: .ply, .spz, .sog, .splat, and so on.
         format: Its name, or itself, where the suffix does not say.
-        frame: `scene.frame`, for its offset of survey coordinates, which files of float32 need; None for none.
+        frame: `scene.frame`, for its offset of survey coordinates and their system. Without it, positions far from 0
+            leave out an offset of their own, as float32 would round them; what is left out is said.
 
     Raises:
         BadInput: No such format, or the splats have no place in it; values that are not finite.
@@ -63,13 +66,27 @@ def save_splats(
     if not isinstance(splats, SplatTable):
         raise BadInput(f"save_splats: expected splats as of run.splats or read_splats, got {type(splats).__name__}")
     file: Path = fit(Path, path, "save_splats")
-    form = format if isinstance(format, Format) else find(Format, format)() if format else format_for(file)
+    form = format_of_words(file, format, "save_splats")
     if form.wants_tree:
         raise BadInput(f"{file}: this format takes levels of detail, which only run.export has; choose another")
+    table = splats.on_cpu()
+    write_told(file, form, table, Frame.of_positions(table.means.numpy()) if frame is None else frame)
+    return file
+
+
+def write_told(file: Path, form: Format, table: SplatTable, frame: Frame, tree: Tile | None = None) -> None:
+    """Write a file of splats as `surfkit export` does, which says too what the file leaves out."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with heard():
-        form.write(file, splats.on_cpu(), frame)
-    return file
+        form.write(file, table, frame, tree)
+    if any(frame.shift) and not isinstance(form, (Tiles3D, HtmlPageFormat)):
+        say(f"{file}: coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
+
+
+def format_of_words(file: Path, given: str | Format | None, where: str) -> Format:
+    """The format that a call gives, by its name or itself, else that of the suffix; BadInput for none."""
+    chosen: Format | None = fit(Format | None, given, f"{where}: format")
+    return format_for(file) if chosen is None else chosen
 
 
 def drawn(splats: SplatTable, camera: Camera, frame: Frame, near: float, rasterizer: Rasterizer) -> Maps:

@@ -23,22 +23,28 @@ MAX_NESTING_DEPTH = 100
 that depends on who calls."""
 
 
-def dump(value: Any) -> Any:
-    """Plain data (what JSON has) for dataclasses, dicts, tuples, paths and scalars; every default is written out."""
+def dump(value: Any, at: str = "") -> Any:
+    """Plain data (what JSON has) for dataclasses, dicts, tuples, paths and scalars; every default is written out.
+
+    `at` is the dotted path of the value, for messages.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         tag = {"use": name_of(value)} if isinstance(value, Component) else {}
-        return tag | {field.name: dump(getattr(value, field.name)) for field in fields(value) if field.init}
+        return tag | {
+            field.name: dump(getattr(value, field.name), _join(at, field.name)) for field in fields(value) if field.init
+        }
     if isinstance(value, dict):
-        return {str(key): dump(item) for key, item in value.items()}
+        return {str(key): dump(item, _join(at, key)) for key, item in value.items()}
     if isinstance(value, (tuple, list)):
-        return [dump(item) for item in value]
+        return [dump(item, _join(at, i)) for i, item in enumerate(value)]
     if isinstance(value, Path):
         return value.as_posix()
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise TypeError(f"{type(value).__name__} cannot be saved; settings are dataclasses, tuples, dicts and plain values")
+    came = f"{place(at)}{type(value).__name__} cannot be saved"
+    raise TypeError(f"{came}; settings are dataclasses, tuples, dicts and plain values")
 
 
 def load(hint: Any, data: Any, at: str = "") -> Any:

@@ -40,7 +40,7 @@ def fit(hint: Any, value: Any, at: str = "") -> Any:
             raise BadInput(f"{place(at)}expected {len(hints)} values, got {len(value)}")
         return tuple(fit(each, item, f"{at}.{i}") for i, (each, item) in enumerate(zip(hints, value, strict=True)))
     if kind is dict and isinstance(value, Mapping):
-        return {key: fit(args[1], item, f"{at}.{key}") for key, item in value.items()}
+        return {fit(args[0], key, f"{at}: its key"): fit(args[1], item, f"{at}.{key}") for key, item in value.items()}
     if isinstance(hint, type) and (is_dataclass(hint) or issubclass(hint, Component)):
         return _fit_part(hint, value, at)
     if hint is Path:

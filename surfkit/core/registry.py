@@ -234,7 +234,7 @@ def name_of(part: Component) -> str:
             return name
     raise BadInput(
         f"no plugin in use offers {class_path(type(part))}; return it from a surfkit_components hook, or in a script "
-        f"call surfkit.offer(NAME, {type(part).__name__})"
+        f"call surfkit.offer(NAME, {type(part).__name__}); make the part anew if the class was defined again"
     )
 
 

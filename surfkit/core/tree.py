@@ -20,7 +20,7 @@ def evolve(node: T, path: str, value: Any) -> T:
         node: Nested frozen dataclasses, dicts and tuples.
         path: Field names, dict keys and tuple positions: "tune.prune.0.ratio". A dict may gain a new last key, and a
             tuple a new last position.
-        value: What to put there; a part may be given by its name, "trim".
+        value: What to put there; a part may be given by its name, "trim". None for the last key of a dict takes it out.
 
     Raises:
         BadInput: No such place, or the value is not allowed there.
@@ -52,8 +52,10 @@ def _evolve(node: Any, path: list[str], depth: int, value: Any) -> Any:
     name, here = path[depth], ".".join(path[:depth]) or type(node).__name__
     last = depth + 1 == len(path)
     if isinstance(node, dict):
-        if name not in node and not last:
+        if name not in node and (not last or value is None):
             raise BadInput(f"{here} has no {name!r}; it has {', '.join(node) or 'nothing'}")
+        if last and value is None:
+            return {key: item for key, item in node.items() if key != name}
         return node | {name: value if last else _evolve(node[name], path, depth + 1, value)}
     if isinstance(node, tuple):
         if not (name.isdecimal() and int(name) < len(node) + last):

@@ -7,10 +7,11 @@ and trimesh 380, 1250 and 390; its PLY has floats only.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
@@ -32,8 +33,15 @@ GLB_UNKNOWN = -1.0
 
 
 def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
-    """Write a mesh in the format that the name ends in, and return the files that were written."""
+    """Write a mesh in the format that the name ends in, and return the files that were written.
+
+    Raises:
+        BadInput: The name ends in no such format.
+    """
     kind = Path(path).suffix.lower()
+    if kind.removeprefix(".") not in get_args(Format):
+        known = ", ".join(f".{name}" for name in get_args(Format))
+        raise BadInput(f"{path}: meshes are written as {known}; name it so")
     if kind == ".glb":
         return write_mesh_glb(path, mesh, frame)
     with replacing(path) as file:

@@ -223,7 +223,7 @@ def refuse_unsaved(recipe: Recipe) -> None:
     try:
         load(Recipe, dump(recipe))
     except TypeError as error:
-        raise BadInput(f"the recipe cannot be saved: {error}; the author of the part has to change that") from error
+        raise BadInput(f"the recipe cannot be saved: {error}; give another value, or change the part") from error
 
 
 def refuse_unplannable(run: Run, scene: Scene) -> None:

@@ -1,8 +1,10 @@
 """What is called after each step may raise anything, in any thread; one process does one thing at a time."""
 
 import threading
+from contextlib import contextmanager
 
 import pytest
+import torch
 from models import data_set
 
 import surfkit
@@ -57,3 +59,23 @@ def test_other_work_around_this_is_refused_in_one_line(scene, tmp_path):
             "2dgs", scene, tmp_path / "run", steps=4, on_step=lambda step: surfkit.train("2dgs", scene, tmp_path / "b")
         )
     assert "\n" not in str(error.value)
+
+
+@contextmanager
+def float64():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("around", [float64, torch.no_grad, torch.inference_mode, lambda: torch.device("meta")])
+def test_what_a_script_has_set_in_torch_does_not_count(scene, tmp_path, around):
+    plain = surfkit.train("2dgs", scene, tmp_path / "plain", steps=3)
+    with around():
+        made, dtype = torch.empty(1), torch.get_default_dtype()
+        inside = surfkit.train("2dgs", scene, tmp_path / "inside", steps=3)
+        assert torch.get_default_dtype() == dtype and torch.empty(1).device == made.device, "and is still set"
+    assert torch.equal(inside.splats.means, plain.splats.means)

@@ -11,6 +11,7 @@ import torch
 from models import data_set
 
 import surfkit
+from surfkit.io.splats.page import HtmlPageFormat
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +141,38 @@ def test_what_is_wrong_is_said_in_one_line(run, wrong, said, tmp_path, monkeypat
     with pytest.raises(surfkit.BadInput, match=said) as error:
         wrong(run, run.dataset, run.dataset.points.mean(0))
     assert "\n" not in str(error.value)
+
+
+def test_what_an_export_leaves_out_is_told(run, tmp_path, capsys):
+    run.export(tmp_path / "page.html", HtmlPageFormat(max_splats=10))
+    assert "the 10 of " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (lambda run: replace(run.splats, sh0=run.splats.sh0.numpy()), "sh0: expected a tensor, got ndarray"),
+        (lambda run: replace(run.splats, kind="surfels"), "kind is 'surfels'; splats are of the kind surfel or gau"),
+        (lambda run: run.dataset.photo(run.dataset.train[0].camera), "expected a view of the data set, .* got Camera"),
+        (lambda run: run.export(5), "export: expected a path, got 5"),
+        (lambda run: run.export("a.ply", 5), "export: format: expected a Format, or the name of one, got 5"),
+        (lambda run: surfkit.save_splats(run.splats, "a.ply", 5), "save_splats: format: expected a Format"),
+        (lambda run: run.mesh(memory=5), "mesh: memory: expected text, got 5"),
+        (lambda run: surfkit.train("2dgs", run.dataset, "x", cache=5), "cache: expected text, got 5"),
+    ],
+)
+def test_values_of_another_type_are_told(run, wrong, said):
+    with pytest.raises(surfkit.BadInput, match=said) as error:
+        wrong(run)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".sog", ".compressed.ply", ".glb"])
+def test_survey_coordinates_are_kept_without_a_frame(run, tmp_path, capsys, suffix):
+    splats = run.splats
+    far = torch.tensor([451000.123, 5873000.456, 50.0], dtype=torch.float64)
+    path = surfkit.save_splats(replace(splats, means=splats.means + far), tmp_path / f"far{suffix}")
+    assert "leave out the offset" in capsys.readouterr().err
+    low, high = (getattr(surfkit.read_splats(path).means, end)(0).values for end in ("min", "max"))
+    assert (low - far - splats.means.min(0).values).abs().max() < 0.01
+    assert (high - far - splats.means.max(0).values).abs().max() < 0.01

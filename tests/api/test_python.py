@@ -174,3 +174,20 @@ def test_points_in_memory_against_a_mesh_of_another_program(page, folder, tmp_pa
     assert whole.f1 > 0.99 and less.precision > 0.85 and less.recall < 0.5
     ours = surfkit.open(folder / "RUN").evaluate(gt=mesh, **settings)
     assert ours.recall > 0.95
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_a_mesh_far_from_0_is_saved_as_it_is(suffix, tmp_path):
+    corners = np.array([[451000.123, 5873000.456, 50.1], [451001.1, 5873000.3, 50.2], [451000.7, 5873001.9, 50.3]])
+    mesh = RunMesh(corners, np.array([[0, 1, 2]], np.int32), crs="EPSG:32633", metres=1.0)
+    found = RunMesh.read(mesh.save(tmp_path / f"mesh.{suffix}"))
+    assert found.vertices == pytest.approx(corners, rel=0, abs=1e-5)
+    assert suffix != "ply" or (found.crs, found.metres) == ("EPSG:32633", 1.0)
+
+
+def test_a_mesh_is_saved_in_formats_that_are_known_only(tmp_path):
+    mesh = RunMesh(np.eye(3), np.array([[0, 1, 2]], np.int32))
+    for name in ("mesh.stl", "mesh", None):
+        with pytest.raises(surfkit.BadInput, match="save: expected a path|meshes are written as .ply, .obj, .glb"):
+            mesh.save(None if name is None else tmp_path / name)
+    assert not list(tmp_path.iterdir())

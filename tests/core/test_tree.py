@@ -75,3 +75,22 @@ def test_a_value_of_another_type_is_refused(world, path, value, message):
     with pytest.raises(BadInput) as caught:
         evolve(world.Recipe(), path, value)
     assert str(caught.value).startswith(message)
+
+
+def test_none_takes_the_entry_of_a_dict_out(world):
+    base = world.Recipe()
+    assert evolve(base, "pretrain.losses.l1", None).pretrain.losses == {
+        name: loss for name, loss in base.pretrain.losses.items() if name != "l1"
+    }
+    with pytest.raises(BadInput, match="pretrain.losses has no 'l3'"):
+        evolve(base, "pretrain.losses.l3", None)
+
+
+def test_keys_are_checked_too(world):
+    with pytest.raises(BadInput, match="pretrain.losses: its key: expected text, got 1"):
+        evolve(world.Recipe(), "pretrain.losses", {1: "l1"})
+
+
+def test_what_cannot_be_saved_is_named_by_its_place(world):
+    with pytest.raises(TypeError, match="pretrain.steps: float32 cannot be saved"):
+        dump(world.Recipe(pretrain=world.Stage(steps=np.float32(3))))

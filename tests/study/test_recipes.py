@@ -204,7 +204,7 @@ def test_a_recipe_that_could_not_be_read_again_is_refused_before_it_runs(part, t
     try:
         plain = recipes()["2dgs"]
         recipe = replace(plain, pretrain=replace(plain.pretrain, prune=(part(),)))
-        with pytest.raises(BadInput, match="recipe cannot be saved: .*author"):
+        with pytest.raises(BadInput, match="recipe cannot be saved: .*change the part"):
             run(recipe, Data(tmp_path), tmp_path / "out")
     finally:
         plugins().unregister(offers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -61,6 +61,11 @@ class SplatTable:
     axes: FileAxes = FileAxes(PLY_AXES)
 
     def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise BadInput(f"kind is {self.kind!r}; splats are of the kind {' or '.join(get_args(Kind))}")
+        for name in SPLAT_COLUMNS:
+            if not isinstance(column := getattr(self, name), Tensor):
+                raise BadInput(f"{name}: expected a tensor, got {type(column).__name__}; torch.as_tensor makes one")
         sizes = expect("means", self.means, ("N", 3))
         expect("quats", self.quats, ("N", 4), sizes)
         expect("log_scales", self.log_scales, ("N", 2 if self.kind == "surfel" else 3), sizes)
