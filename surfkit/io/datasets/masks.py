@@ -284,7 +284,8 @@ def _index(folders: Sequence[Path]) -> dict[str, set[Path]]:
 
 def _beside(shots: Sequence[RawImage]) -> dict[Path, Path]:
     """Masks in the folders of photographs, by the path without ending and mark, the name in small letters."""
-    photos, found = {shot.path for shot in shots}, {}
+    photos = {shot.path for shot in shots}
+    found: dict[Path, Path] = {}
     for folder in sorted({path.parent for path in photos}):
         for path in sorted(folder.iterdir()) if folder.is_dir() else ():
             if path not in photos and path.suffix.lower() in MASK_SUFFIXES and (name := masked_name(path.name)):
