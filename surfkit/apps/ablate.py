@@ -76,7 +76,7 @@ class AblateCommand:
     LABEL=FILE, such as OpenMVS=scene_mesh.ply. They are measured as those of the rows are, and stand below them."""
 
     rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
-    """Run only these rows, by number or label; finished results of the other rows are shown, too."""
+    """Run only these rows, by label or number; finished results of the other rows are shown, too."""
 
     columns: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all that were measured)")] = ()
     """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, accuracy, completeness, chamfer,

@@ -181,14 +181,17 @@ def limit_points(recipe: Recipe, points: int | None) -> Recipe:
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:
-    """Labels of the rows that `names` give by number or label, in the order of the table; all if there are none."""
+    """Labels of the rows that `names` give by label or number, in the order of the table; all if there are none.
+
+    A label comes first: rows may be called 1, 2 and 3 after a setting.
+    """
     labels = [row.label for row in table.rows]
     chosen = set()
     for name in names:
-        if name.isdecimal() and 1 <= int(name) <= len(labels):
-            chosen.add(labels[int(name) - 1])
-        elif name in labels:
+        if name in labels:
             chosen.add(name)
+        elif name.isdecimal() and 1 <= int(name) <= len(labels):
+            chosen.add(labels[int(name) - 1])
         else:
             raise BadInput(f"--rows: {unknown('row', name, labels)}; or give its number, 1 to {len(labels)}")
     return [label for label in labels if label in chosen or not names]

@@ -226,6 +226,9 @@ def test_rows_are_picked_by_number_or_label():
     for wrong in ("0", "4", "strt"):
         with pytest.raises(BadInput, match=f"no row .*'{wrong}'.*known: start, given up, end; .* 1 to 3"):
             pick(FALLBACKS, [wrong])
+    degrees = Table("degrees", "", COARSE_BASELINE, tuple(Row(f"{n}", {"primitive.sh_degree": n}) for n in range(4)))
+    assert pick(degrees, ["2"]) == ["2"], "the row of that name, which is the third"
+    assert pick(degrees, ["4"]) == ["3"]
 
 
 def test_a_row_may_be_a_recipe_of_its_own():
