@@ -23,6 +23,7 @@ from surfkit.evaluate.geometry.repetition import (
     cloud_side,
     mesh_side,
     refuse_few,
+    warn_if_rounded,
     warn_if_sparse,
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
@@ -227,8 +228,9 @@ def compare(
     ours = make_side(reconstruction, None, settings.samples, own_tau, own_box)
     if theirs.sparse is not None:
         theirs = make_side(truth, None, settings.samples, tau, box)
-    warn_if_sparse(ours, own_tau)
-    warn_if_sparse(theirs, tau)
+    for side, surface, length in ((ours, reconstruction, own_tau), (theirs, truth, tau)):
+        warn_if_sparse(side, length)
+        warn_if_rounded(surface, length)
     draws: list[RepetitionResult] = []
     others: dict[str, RepetitionResult | None] = {}
     done, total = 0, len(ALIGNMENTS) + settings.draws - 1
