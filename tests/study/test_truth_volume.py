@@ -21,7 +21,7 @@ def level(z, half=HALF_M):
 
 def write(path, *parts):
     vertices = np.concatenate([part[0] for part in parts])
-    faces = np.concatenate([part[1] + at * SIDE * SIDE for at, part in enumerate(parts)])
+    faces = np.concatenate([part[1] + at * SIDE * SIDE for at, part in enumerate(parts)])  # all but the last are level
     head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
     head += "property double x\nproperty double y\nproperty double z\n"
     head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
@@ -36,11 +36,14 @@ def test_a_false_ground_counts_whatever_was_measured_before(tmp_path, monkeypatc
     write(tmp_path / "truth.ply", level(0.0))
     write(tmp_path / "good.ply", level(0.0))
     write(tmp_path / "false.ply", level(0.0), level(-10 * TAU, HALF_M / 2))
+    wide = np.array([[-40.0, -40, -10 * TAU], [40, -40, -10 * TAU], [40, 40, -10 * TAU], [-40, 40, -10 * TAU]])
+    write(tmp_path / "wide.ply", level(0.0), (wide, np.array([[0, 1, 2], [0, 2, 3]])))
     truth = Truth(tmp_path / "truth.ply", TAU, Comparison(classes=False, align="none", draws=1))
     found = {}
     for order in (("good", "false"), ("false", "good")):
-        for name in order:
+        for name in (*order, "wide"):
             out = tmp_path / "-".join(order) / name
             figures = truth.compare(tmp_path / f"{name}.ply", out, scene)["geometry"]
             found.setdefault(name, []).append(figures["precision"])
     assert found["good"] == pytest.approx([1, 1], abs=0.01) and found["false"] == pytest.approx([0.8, 0.8], abs=0.05)
+    assert found["wide"] == pytest.approx([0.5, 0.5], abs=0.05), "no corner of its false ground lies in the volume"

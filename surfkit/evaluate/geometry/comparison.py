@@ -11,7 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.evaluate.geometry.compared_area import compared_area, seen_from
+from surfkit.evaluate.geometry.compared_area import compared_area
 from surfkit.evaluate.geometry.presets import PRESETS, PresetName
 from surfkit.evaluate.geometry.registration import ICP_ROUNDS
 from surfkit.evaluate.geometry.repetition import (
@@ -28,10 +28,10 @@ from surfkit.evaluate.geometry.repetition import (
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
-from surfkit.evaluate.geometry.transform import read_transform, scale_of
+from surfkit.evaluate.geometry.transform import read_transform, scale_of, seen_from
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
 from surfkit.io.area import Area, require_area
-from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
+from surfkit.scene.crop import Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5
@@ -304,10 +304,7 @@ def around(crop: Crop | None, area: Box | None, tau: float) -> Box | None:
     room = ICP_ROUNDS[0][1] * tau
     if crop is None:
         return None if area is None else (area[0] - room, area[1] + room)
-    plane, along = list(PLANES[crop.axis]), "xyz".index(crop.axis)
-    low, high = np.empty(3), np.empty(3)
-    low[plane], high[plane] = crop.polygon.min(0), crop.polygon.max(0)
-    low[along], high[along] = crop.low, crop.high
+    low, high = crop.ends
     if area is not None:
         low, high = np.maximum(low, area[0]), np.minimum(high, area[1])
     return low - room, high + room
