@@ -237,6 +237,23 @@ def test_laser_scans_are_clouds(tmp_path, name, warned, monkeypatch):
     assert len(warned) == 1 and "667 of 2,000 points are used" in warned[0]
 
 
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_points_that_a_scan_marks_as_bad_are_left_out(tmp_path, warned, point_format):
+    path = tmp_path / "scan.las"
+    scan(path, PLACES)
+    laspy = needs("laspy")
+    made = laspy.convert(laspy.read(path), point_format_id=point_format)
+    made.classification[:100] = 7
+    made.withheld[50:150] = 1
+    made.write(path)
+    assert np.abs(read_surface(path).vertices() - PLACES[150:]).max() < 1e-3
+    assert warned == [f"{path}: 150 points are left out, which it marks as withheld or as noise"]
+    made.withheld[:] = 1
+    made.write(path)
+    with pytest.raises(BadInput, match="no points in it but 2,000 of noise"):
+        read_surface(path)
+
+
 def test_a_file_that_is_no_scan_is_refused(tmp_path):
     needs("laspy")
     (tmp_path / "a.las").write_bytes(b"LASF, but no more")

@@ -20,6 +20,8 @@ CHUNK_POINTS = 1_000_000
 """Points in memory besides."""
 RECORDS = {"WktCoordinateSystemVlr", "GeoKeyDirectoryVlr"}
 """Of laspy, what a reference system is in."""
+NOISE_CLASSES = (7, 18)
+"""Of the LAS specification: low and high noise, which is no surface."""
 COLOR_FIELDS = ("red", "green", "blue")
 
 
@@ -53,8 +55,9 @@ def read_e57(path: Path) -> np.ndarray:
 def read_las(path: Path, most: int = MAX_POINTS) -> tuple[np.ndarray, np.ndarray | None, dict[str, str]]:
     """(N, 3) float64 positions, (N, 3) uint8 colours, and what the file says of its coordinates, as PLY headers do.
 
-    It is read in pieces. Of more than `most` points every second, third and so on is taken. Colours are None where the
-    file has none.
+    It is read in pieces. Of more than `most` points every second, third and so on is taken. Points that the file marks
+    as withheld, which stands for deleted, or as noise are left out, and a warning says how many. Colours are None where
+    the file has none.
 
     Raises:
         BadInput: laspy is not installed, or the file is damaged or empty.
@@ -66,15 +69,17 @@ def read_las(path: Path, most: int = MAX_POINTS) -> tuple[np.ndarray, np.ndarray
             import lazrs  # noqa: F401 (what laspy reads it with)
     try:
         with laspy.open(path) as file:
-            xyz, rgb = _points(file, most)
+            xyz, rgb, bad = _points(file, most)
             notes = _notes(path, file.header)
     except Exception as error:  # laspy and lazrs have errors of many kinds
         if is_out_of_memory(error):
             raise
         raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}; write or copy it again") from error
     if not len(xyz):
-        raise BadInput(f"{path}: there are no points in it")
-    _tell_fewer(path, len(xyz), file.header.point_count)
+        raise BadInput(f"{path}: there are no points in it" + (f" but {bad:,} of noise" if bad else ""))
+    if bad:
+        emit(Warned(f"{path}: {bad:,} points are left out, which it marks as withheld or as noise"))
+    _tell_fewer(path, len(xyz) + bad, file.header.point_count)
     return xyz, rgb, notes
 
 
@@ -91,21 +96,23 @@ def _tell_fewer(path: Path, used: int, count: int) -> None:
         emit(Warned(f"{path}: {used:,} of {count:,} points are used"))
 
 
-def _points(file: Any, most: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions, and colours if there are some."""
-    every, before, places, colors = max(1, -(-file.header.point_count // most)), 0, [], []
+def _points(file: Any, most: int) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Positions, colours if there are some, and how many of the points that were looked at are left out."""
+    every, before, bad, places, colors = max(1, -(-file.header.point_count // most)), 0, 0, [], []
     colored = set(COLOR_FIELDS) <= set(file.header.point_format.dimension_names)
     for chunk in file.chunk_iterator(CHUNK_POINTS):
-        rows = slice(-before % every, None, every)
+        rows = np.arange(-before % every, len(chunk), every)
         before += len(chunk)
+        marked = np.asarray(chunk.withheld, bool) | np.isin(np.asarray(chunk.classification), NOISE_CLASSES)
+        bad, rows = bad + int(marked[rows].sum()), rows[~marked[rows]]
         places.append(np.stack([np.asarray(chunk[axis])[rows] for axis in "xyz"], axis=1))
         if colored:
             colors.append(np.stack([np.asarray(chunk[name])[rows] for name in COLOR_FIELDS], axis=1))
     xyz = np.concatenate(places) if places else np.zeros((0, 3))
     rgb = np.concatenate(colors) if colors else np.zeros((0, 3), np.uint16)
     if not rgb.any():
-        return xyz, None
-    return xyz, (rgb >> 8 if rgb.max() > 255 else rgb).astype(np.uint8)  # some programs write 8 bits
+        return xyz, None, bad
+    return xyz, (rgb >> 8 if rgb.max() > 255 else rgb).astype(np.uint8), bad  # some programs write 8 bits
 
 
 def _notes(path: Path, header: Any) -> dict[str, str]:
