@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -458,6 +460,18 @@ def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 4 and said[0].startswith("run 1 of 2: base, seed 0, in ")
     assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"
+
+
+def test_runs_on_folders_of_one_name_are_told_apart(data, runs, tmp_path, monkeypatch, capsys):
+    for name in ("north", "south"):
+        shutil.copytree(data.path, tmp_path / name / "dense")
+    (tmp_path / "here").symlink_to(tmp_path / "south" / "dense")
+    monkeypatch.chdir(tmp_path / "north" / "dense")
+    both = (Data(Path()), Data(tmp_path / "here"))
+    with AblationScreen(Console(file=io.StringIO())) as screen:
+        ablate(AblationPlan(TABLE, both, tmp_path / "out", rows=("base",)), screen)
+    said = capsys.readouterr().err
+    assert "base, seed 0 on north/dense, in" in said and "base, seed 0 on south/dense, in" in said
 
 
 def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
