@@ -93,14 +93,35 @@ def offered_tables() -> dict[str, Table]:
         BadInput: Two packages offer the same table, or the same row of a table.
     """
     tables = offered_once("surfkit_tables", "an ablation table")
+    found = dict(tables)
     for owner, name, rows in offered("surfkit_rows"):
         if name not in tables:
             emit(Warned(f"plugin {owner} adds rows to table:{name}, which no package offers; they are left out"))
             continue
-        own = tables[name].rows
-        end = next((at for at, row in enumerate(own) if row.group == BASELINE), len(own))
-        tables[name] = replace(tables[name], rows=(*own[:end], *rows, *own[end:]))
-    return tables
+        found[name] = with_rows_of_others(found[name], rows, tables[name])
+    return found
+
+
+def with_rows_of_others(table: Table, rows: Sequence[Row], own: Table) -> Table:
+    """A table with rows of another package, above its baseline.
+
+    They build on the last kept row of the table's own, or on one another. No other row builds on them: what a row
+    trains, and what it is compared with, does not depend on which packages are installed.
+
+    Args:
+        table: With the rows of other packages so far.
+        rows: To add.
+        own: The table as it was offered.
+    """
+    end = next((at for at, row in enumerate(table.rows) if row.group == BASELINE), len(table.rows))
+    before, after, below = table.rows[:end], table.rows[end:], built_on(own)
+    ours = {row.label for row in own.rows if row.kept}
+    base = next((row.label for row in reversed(before) if row.label in ours), None)
+    added, last = [], base
+    for row in rows:  # without a row to name, later ones could not be kept from building on a kept one
+        added.append(replace(row, on=row.on or last, kept=row.kept and base is not None))
+        last = row.label if row.kept else last
+    return replace(table, rows=(*before, *added, *(replace(row, on=below[row.label]) for row in after)))
 
 
 def build(table: Table) -> dict[str, Recipe]:

@@ -239,6 +239,18 @@ def test_a_row_may_be_a_recipe_of_its_own():
     assert replace(built["next"], about=other.about) == evolve(evolve(other, "primitive.sh_degree", 0), "seed", 7)
 
 
+def test_no_row_builds_on_those_that_another_package_adds():
+    tail = (Row("c", {"seed": 3}, kept=False), Row("alone", {"primitive.sh_degree": 0}, group=ablation.BASELINE))
+    own = Table("mine", "", COARSE_BASELINE, (Row("a", {"seed": 1}), Row("b", {"seed": 2}), *tail))
+    first = ablation.with_rows_of_others(own, (Row("x", {"seed": 7}), Row("y", {"primitive.sh_degree": 1})), own)
+    both = ablation.with_rows_of_others(first, (Row("z", {"primitive.sh_degree": 1}),), own)
+    assert built_on(both) == {"a": None, "b": "a", "c": "b", "x": "b", "y": "x", "z": "b", "alone": "b"}
+    assert {label: build(both)[label] for label in build(own)} == build(own)
+    aside = replace(own, rows=(replace(own.rows[0], kept=False), replace(tail[1], kept=False)))
+    both = ablation.with_rows_of_others(aside, (Row("x", {"seed": 7}),), aside)
+    assert built_on(both) == {"a": None, "x": None, "alone": None}
+
+
 def test_packages_add_rows_to_tables_of_others(monkeypatch):
     class Plugin:
         @hookimpl
@@ -254,7 +266,8 @@ def test_packages_add_rows_to_tables_of_others(monkeypatch):
     finally:
         reload()
     rows = tables["methods"].rows
-    assert rows[: len(METHODS_TABLE.rows)] == METHODS_TABLE.rows and rows[-1] == Row("ours", {"seed": 3})
+    assert rows[: len(METHODS_TABLE.rows)] == METHODS_TABLE.rows
+    assert rows[-1] == Row("ours", {"seed": 3}, on=next(row.label for row in reversed(METHODS_TABLE.rows) if row.kept))
     labels = [row.label for row in tables["trim"].rows]
     assert labels[-2:] == ["ours", "stereo alone"], "what has no splats stays apart from what has"
     assert "lost" not in tables
