@@ -61,7 +61,7 @@ def distinct_names(paths: Sequence[str]) -> list[str]:
     parts = [path.split("/") for path in paths]
     lengths = range(1, max(map(len, parts), default=1) + 1)
     tails = (["/".join(each[-length:]) for each in parts] for length in lengths)
-    return next((names for names in tails if len(set(names)) == len(names)), list(paths))
+    return next((names for names in tails if len(set(names)) == len(names)), [each[-1] for each in parts])
 
 
 def columns_of(report: Mapping[str, Any]) -> list[str]:
