@@ -65,7 +65,7 @@ class AblateCommand:
 
     gt: tuple[Path, ...] = ()
     """Ground truth of each data set in the order of --data, a mesh or a point cloud: the mesh of every row is compared
-    with it, for F1, in the same crop volume. Rows without a mesher get mesh:tsdf then."""
+    with it, for F1. Rows without a mesher get mesh:tsdf then."""
 
     tau: tuple[float, ...] = ()
     """With --gt: distance threshold below which a point counts as correct, in units of the ground truth; one for each
@@ -73,11 +73,10 @@ class AblateCommand:
 
     meshes: tuple[str, ...] = ()
     """With --gt: meshes that other programs made of the same photographs, in the frame of the data set, each as
-    LABEL=FILE, such as OpenMVS=scene_mesh.ply. They are measured as those of the rows are, in the same crop volume, and
-    stand below them."""
+    LABEL=FILE, such as OpenMVS=scene_mesh.ply. They are measured as those of the rows are, and stand below them."""
 
     rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
-    """Run only these rows, by number or label; finished results of the other rows are shown, too."""
+    """Run only these rows, by label or number; finished results of the other rows are shown, too."""
 
     columns: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all that were measured)")] = ()
     """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, accuracy, completeness, chamfer,

@@ -17,6 +17,7 @@ from surfkit.runs.recipe import Recipe
 from surfkit.study.rows import Trial
 from surfkit.study.shared_stages import Key, finished_keys, keys_of
 from surfkit.study.study import AblationPlan, trials
+from surfkit.study.table_text import distinct_names
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class Needs:
 def foretell(plan: AblationPlan, left: Sequence[Trial], probe_steps: int) -> None:
     """Print what the trials that are left of a table will take in time and disk, in a line or two for each data set."""
     done = finished_keys(trials(plan)) if plan.shared else set()
-    for data, _ in plan.sets:
+    names = distinct_names([str(data.path.resolve()) for data in plan.data])
+    for name, data in zip(names, plan.data, strict=True):
         here = [trial for trial in left if trial.data == data]
         needs, first = needs_of(here, done, plan.shared), next((t for t in here if t.recipe.has_stages), None)
         if first is None:
@@ -57,7 +59,7 @@ def foretell(plan: AblationPlan, left: Sequence[Trial], probe_steps: int) -> Non
         if found is None:
             say(f"forecast: none for {data.path}: {'; '.join(finding.text for finding in findings)}")
             continue
-        for line in lines(plan, data.path.resolve().name, needs, first.recipe, found):
+        for line in lines(plan, name, needs, first.recipe, found):
             say(f"forecast: {line}")
 
 

@@ -12,6 +12,7 @@ import tyro
 from surfkit.apps.run_summary import quality_rows, show, show_geometry, show_levels
 from surfkit.cli.console_table import print_table, tell
 from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
@@ -37,6 +38,9 @@ from surfkit.scene.scene import Scene
 from surfkit.study.photo_zones import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 from surfkit.train.faults import full_disk_in_one_line
 from surfkit.train.progress_bars import bars
+
+OF_THE_MEASURING = ("file", "cpu_seconds")
+"""Of what is measured of a mesh by itself, what says nothing of the mesh."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,7 @@ class EvaluateCommand:
         found = mesh_alone(read_surface(self.target), scene)
         if not found:
             raise BadInput(f"{self.target}: a cloud of points, not a mesh; to measure it, name the truth with --gt")
+        forget_others(out / "metrics.json", found)
         note_metrics(out / "metrics.json", found)
         print_table(("mesh", "value"), quality_rows(found["mesh"]))
 
@@ -217,6 +222,7 @@ class EvaluateCommand:
             seams,
         )
         found = measured["geometry"]
+        forget_others(out / "metrics.json", measured)
         metrics, images = note_metrics(out / "metrics.json", measured), {}
         if scene is not None and scene.held_out and zones != Zones():
             images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
@@ -253,6 +259,19 @@ def mesh_alone(surface: SurfaceFile, scene: Scene | None) -> dict[str, Any]:
     """What metrics.json is to say of a mesh by itself; nothing of a cloud."""
     metres = None if scene is None else scene.frame.metres
     return {} if surface.faces is None else {"mesh": measure_mesh(surface, metres).figures}
+
+
+def forget_others(path: Path, found: dict[str, Any]) -> None:
+    """Take out of metrics.json what is there of another surface than that which was measured now: of an earlier file
+    of that name, or of mesh.obj where mesh.ply had its place."""
+    metrics = read_json(path, dict[str, Any]) if path.exists() else {}
+    before, now = (each.get("mesh") or {} for each in (metrics, found))
+    own = all(before.get(name) == now.get(name) for name in before.keys() | now.keys() if name not in OF_THE_MEASURING)
+    if own or not {"mesh", "geometry"} & metrics.keys():
+        return
+    if "geometry" in metrics and "geometry" not in found:
+        emit(Warned(f"{path}: precision, recall and F1 were of another mesh and are gone; --gt measures this one"))
+    write_json(path, {name: it for name, it in metrics.items() if name not in ("mesh", "geometry")})
 
 
 COMMAND = EvaluateCommand

@@ -232,8 +232,13 @@ def compressed_rows(record: dict[str, Any], metrics: dict[str, Any] | None) -> l
             )
     if both := small.get("fps_before_and_after"):
         rows.append(("frames a second", f"{both[0]:.1f}", f"{both[1]:.1f}"))
-    if "geometry" in metrics and "geometry" in small:
-        own_f1, f1 = metrics["geometry"]["f1"], small["geometry"]["f1"]
+    surfaces = [each.get("geometry") or {} for each in (metrics, small)]
+    own_f1, f1 = (each.get("f1") for each in surfaces)
+    if (
+        own_f1 is not None
+        and f1 is not None
+        and all(surfaces[0].get(name) == surfaces[1].get(name) for name in ("truth", "tau"))
+    ):
         rows.append(("F1", f"{own_f1:.4f}", f"{f1:.4f} ({f1 - own_f1:+.4f})"))
     return rows
 

@@ -152,7 +152,7 @@ def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
     facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
     facts["fps_before_and_after"] = found.get("fps_before_and_after")
     if "geometry" in found:
-        kept = ("precision", "recall", "f1", "truth", "tau", "table", "normals", "roughness")
+        kept = ("precision", "recall", "f1", "truth", "tau", "table", "chamfer_dtu", "normals", "roughness")
         facts["geometry"] = {name: value for name, value in found["geometry"].items() if name in kept}
     if "mesh" in found:
         facts["mesh"] = found["mesh"]

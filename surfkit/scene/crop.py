@@ -40,6 +40,15 @@ class Crop:
         x, y = self.polygon.T
         return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
 
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3,) least and (3,) greatest coordinates."""
+        low, high = np.empty(3), np.empty(3)
+        plane, along = list(PLANES[self.axis]), "xyz".index(self.axis)
+        low[plane], high[plane] = self.polygon.min(0), self.polygon.max(0)
+        low[along], high[along] = self.low, self.high
+        return low, high
+
     def inside(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool: which of the (n, 3) points lie in it."""
         along = points[:, "xyz".index(self.axis)]

@@ -93,14 +93,35 @@ def offered_tables() -> dict[str, Table]:
         BadInput: Two packages offer the same table, or the same row of a table.
     """
     tables = offered_once("surfkit_tables", "an ablation table")
+    found = dict(tables)
     for owner, name, rows in offered("surfkit_rows"):
         if name not in tables:
             emit(Warned(f"plugin {owner} adds rows to table:{name}, which no package offers; they are left out"))
             continue
-        own = tables[name].rows
-        end = next((at for at, row in enumerate(own) if row.group == BASELINE), len(own))
-        tables[name] = replace(tables[name], rows=(*own[:end], *rows, *own[end:]))
-    return tables
+        found[name] = with_rows_of_others(found[name], rows, tables[name])
+    return found
+
+
+def with_rows_of_others(table: Table, rows: Sequence[Row], own: Table) -> Table:
+    """A table with rows of another package, above its baseline.
+
+    They build on the last kept row of the table's own, or on one another. No other row builds on them: what a row
+    trains, and what it is compared with, does not depend on which packages are installed.
+
+    Args:
+        table: With the rows of other packages so far.
+        rows: To add.
+        own: The table as it was offered.
+    """
+    end = next((at for at, row in enumerate(table.rows) if row.group == BASELINE), len(table.rows))
+    before, after, below = table.rows[:end], table.rows[end:], built_on(own)
+    ours = {row.label for row in own.rows if row.kept}
+    base = next((row.label for row in reversed(before) if row.label in ours), None)
+    added, last = [], base
+    for row in rows:  # without a row to name, later ones could not be kept from building on a kept one
+        added.append(replace(row, on=row.on or last, kept=row.kept and base is not None))
+        last = row.label if row.kept else last
+    return replace(table, rows=(*before, *added, *(replace(row, on=below[row.label]) for row in after)))
 
 
 def build(table: Table) -> dict[str, Recipe]:
@@ -181,14 +202,17 @@ def limit_points(recipe: Recipe, points: int | None) -> Recipe:
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:
-    """Labels of the rows that `names` give by number or label, in the order of the table; all if there are none."""
+    """Labels of the rows that `names` give by label or number, in the order of the table; all if there are none.
+
+    A label comes first: rows may be called 1, 2 and 3 after a setting.
+    """
     labels = [row.label for row in table.rows]
     chosen = set()
     for name in names:
-        if name.isdecimal() and 1 <= int(name) <= len(labels):
-            chosen.add(labels[int(name) - 1])
-        elif name in labels:
+        if name in labels:
             chosen.add(name)
+        elif name.isdecimal() and 1 <= int(name) <= len(labels):
+            chosen.add(labels[int(name) - 1])
         else:
             raise BadInput(f"--rows: {unknown('row', name, labels)}; or give its number, 1 to {len(labels)}")
     return [label for label in labels if label in chosen or not names]

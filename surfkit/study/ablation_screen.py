@@ -18,7 +18,7 @@ from surfkit.core.check import printable
 from surfkit.core.events import say
 from surfkit.study.metric_columns import TABLE_COLUMNS
 from surfkit.study.rows import Trial, TrialResult
-from surfkit.study.table_text import drawing
+from surfkit.study.table_text import data_names, drawing
 from surfkit.train.progress import outer
 
 TOLD = {"psnr": "PSNR {} dB", "ssim": "SSIM {}", "lpips": "LPIPS {}", "f1": "F1 {}", "points": "{} points"}
@@ -49,7 +49,9 @@ class AblationScreen:
     def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
         """See `Watch.begin`."""
         self.report, self.label = report, trial.label
-        where = f" on {trial.data.path.name}" if len(report["data_sets"]) > 1 else ""
+        paths = [entry["data"]["path"] for entry in report["data_sets"]]
+        names = dict(zip(paths, data_names(report), strict=True))
+        where = f" on {names[str(trial.data.path.resolve())]}" if len(names) > 1 else ""
         self.heading = f"run {at} of {count}: {trial.label}, seed {trial.seed}{where}"
         self.headings[trial.folder] = self.heading
         if self.live is None:

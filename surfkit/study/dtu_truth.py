@@ -56,7 +56,7 @@ class DTUTruth(Truth):
         read_scale(self.scale)
 
     @property
-    def _record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         return {"tau": None, "protocol": "dtu"}
 
     def silhouettes(self, count: int) -> list[np.ndarray]:
@@ -70,7 +70,7 @@ class DTUTruth(Truth):
             raise BadInput(f"{self.masks}: {len(paths)} masks for {count} photographs; there must be one for each")
         return [read_mask(path, photo_size(path)).numpy() for path in paths]
 
-    def compare(self, mesh: Path, folder: Path, out: Path, scene: Scene) -> dict[str, Any]:
+    def compare(self, mesh: Path, folder: Path, scene: Scene) -> dict[str, Any]:
         """See `Truth.compare`; nothing is written, as there is no crop volume."""
         surface = read_surface(mesh)
         if surface.faces is None:
@@ -86,7 +86,7 @@ class DTUTruth(Truth):
         geometry = {
             "truth": str(self.path),
             "reconstruction": str(mesh),
-            "table": {**self._record, "truth": self.stamp},
+            "table": {**self.record, "truth": self.stamp},
             "chamfer_dtu": {**found, "far": FAR_MM},
             "points": {"reconstruction": len(counted.to_truth), "truth": len(counted.to_reconstruction)},
         }

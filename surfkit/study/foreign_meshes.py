@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, read_json
+from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface_file import read_surface
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.read import read
@@ -19,6 +21,9 @@ from surfkit.study.row_comparison import compared, surface_figures
 from surfkit.study.rows import TrialResult
 from surfkit.study.truth import Truth
 from surfkit.train.progress_bars import bars
+
+if TYPE_CHECKING:
+    from surfkit.study.study import AblationPlan
 
 MESHES_FOLDER = "meshes"
 """In that of a table: what was measured of meshes of other programs."""
@@ -55,24 +60,30 @@ class OtherMesh:
         if read_surface(self.path).faces is None:
             raise BadInput(f"--meshes {self.label}: {self.path} is a cloud of points; name a mesh")
 
-    def folder(self, truth: Truth, out: Path) -> Path:
-        """Where its measurements are kept; of another file, or of another truth, they lie elsewhere."""
+    def folder(self, truth: Truth, data: Data, out: Path) -> Path:
+        """Where its measurements are kept; of another file, truth or data set, or by another version, they lie
+        elsewhere."""
         state = self.path.stat()
-        made = f"{self.path.resolve()} {state.st_size} {state.st_mtime_ns} {truth.path} {truth.tau} {truth.stamp}"
-        return out / MESHES_FOLDER / hashlib.sha256(made.encode()).hexdigest()[:12]
+        parts = {
+            "mesh": [str(self.path.resolve()), state.st_size, state.st_mtime_ns],
+            "truth": [str(truth.path), truth.stamp, truth.record],
+            "data": dump(replace(data, path=data.path.resolve())),  # whose views decide the volume, and the unit
+            "version": own_version(),
+        }
+        return out / MESHES_FOLDER / hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
     def measure(self, truth: Truth, data: Data, out: Path) -> None:
-        """Compare it with the truth as the meshes of all rows are, in the same volume, and keep what came out.
+        """Compare it with the truth as the meshes of all rows are, and keep what came out.
 
         Raises:
             BadInput: It is nowhere near the truth, or one of the two cannot be used.
         """
-        folder = self.folder(truth, out)
-        note_metrics(folder / "metrics.json", truth.compare(self.path, folder / "geometry", out, read(data)))
+        folder = self.folder(truth, data, out)
+        note_metrics(folder / "metrics.json", truth.compare(self.path, folder / "geometry", read(data)))
 
-    def figures(self, truth: Truth, out: Path) -> dict[str, float] | None:
+    def figures(self, truth: Truth, data: Data, out: Path) -> dict[str, float] | None:
         """Its numbers, by the names of columns; None before it was measured."""
-        path = self.folder(truth, out) / "metrics.json"
+        path = self.folder(truth, data, out) / "metrics.json"
         if not path.exists():
             return None
         metrics = read_json(path, dict[str, Any])
@@ -83,10 +94,10 @@ class OtherMesh:
 def measured_mesh(mesh: OtherMesh, truth: Truth, data: Data, out: Path) -> TrialResult:
     """The numbers of a mesh, which is measured if it was not yet, or why it could not be."""
     try:
-        if mesh.figures(truth, out) is None:
+        if mesh.figures(truth, data, out) is None:
             with bars():
                 mesh.measure(truth, data, out)
-        return TrialResult(mesh.figures(truth, out))
+        return TrialResult(mesh.figures(truth, data, out))
     except BadInput as error:
         return TrialResult(failed=" ".join(str(error).split()))
 
@@ -107,22 +118,21 @@ def refuse_unfit(meshes: Sequence[OtherMesh], table: Table, data_sets: int, has_
 
 
 def mesh_rows(
-    meshes: Sequence[OtherMesh], truth: Truth, out: Path, outcomes: Mapping[Path, TrialResult], before: int
+    plan: AblationPlan, place: tuple[Data, Truth], outcomes: Mapping[Path, TrialResult]
 ) -> list[dict[str, Any]]:
     """Plain data of the rows of meshes, as those of a table are.
 
     Args:
-        meshes: In their order.
-        truth: What they are compared with.
-        out: Folder of the table.
+        plan: Of the table, whose own rows stand above.
+        place: The photographs that they are of, and what they are compared with.
         outcomes: Of those that were measured now, by their folders.
-        before: Rows above.
     """
-    rows = []
-    for at, mesh in enumerate(meshes):
-        found = mesh.figures(truth, out)
+    rows, (data, truth) = [], place
+    before, out = len(plan.table.rows), plan.out
+    for at, mesh in enumerate(plan.meshes):
+        found = mesh.figures(truth, data, out)
         row = Row(mesh.label, group="" if at else GROUP)
-        folder = mesh.folder(truth, out)
+        folder = mesh.folder(truth, data, out)
         rows.append(
             compared(before + at + 1, row, None, {} if found is None else {mesh.label: {0: found}})
             | {

@@ -13,7 +13,7 @@ from surfkit.study.table_text import (
     blanks,
     caption,
     columns_of,
-    data_name,
+    data_names,
     data_sets,
     measured_cells,
     published_columns,
@@ -59,7 +59,8 @@ def latex(report: Mapping[str, Any]) -> str:
     """
     entries, names = data_sets(report), columns_of(report)
     rows, paper = entries[0]["rows"], published_columns(report, names)
-    groups = [(data_name(entry), names, measured_cells(entry["rows"], names)) for entry in entries]
+    named = zip(data_names(report), entries, strict=True)
+    groups = [(data, names, measured_cells(entry["rows"], names)) for data, entry in named]
     groups += [("published", paper, published(rows, paper))] if paper else []
     width = 1 + sum(len(columns) for _, columns, _ in groups)
     body = []

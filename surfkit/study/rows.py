@@ -63,7 +63,6 @@ class TrialJob:
 
     Attributes:
         trial: What to run.
-        out: Folder of the table.
         device: Where to compute.
         store: Folder of finished stages that the rows share; None shares none.
         cache: Memory for photographs, see `CacheSettings`.
@@ -72,7 +71,6 @@ class TrialJob:
     """
 
     trial: Trial
-    out: Path
     device: Device = "auto"
     store: Path | None = None
     cache: str = "auto"
@@ -139,7 +137,7 @@ def measured(work: TrialJob, found: dict[str, int | float]) -> dict[str, int | f
     """The numbers of a finished run, with those of its mesh and LPIPS where they are wanted."""
     trial, compressed = work.trial, work.trial.recipe.compress is not None
     if trial.truth is not None and trial.truth.figure not in found:
-        found = figures(trial.truth.measure(trial.folder, work.out, work.device), compressed)
+        found = figures(trial.truth.measure(trial.folder, work.device), compressed)
     if work.lpips and "lpips" not in found and "psnr" in found:
         again = figures(measure_lpips(trial.folder, work.device), compressed)
         found |= {name: again[name] for name in ("lpips",) if name in again}
@@ -173,7 +171,7 @@ def job_of(at: int, work: TrialJob) -> Job:
     folder, recipe = work.trial.folder.resolve(), work.trial.recipe
     folder.mkdir(parents=True, exist_ok=True)
     (folder / OUTCOME_FILE).unlink(missing_ok=True)
-    own = replace(work, trial=replace(work.trial, folder=folder), out=work.out.resolve())
+    own = replace(work, trial=replace(work.trial, folder=folder))
     write_json(folder / ROW_FILE, own if own.store is None else replace(own, store=own.store.resolve()))
     return Job(
         index=at,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from surfkit.study.metric_columns import TABLE_COLUMNS
-from surfkit.study.table_text import data_name, data_sets
+from surfkit.study.table_text import data_names, data_sets
 
 CSV_HEADER = (
     "table",
@@ -30,11 +30,11 @@ def comma_separated(report: Mapping[str, Any]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, CSV_HEADER, restval="", lineterminator="\n")
     writer.writeheader()
-    for entry in data_sets(report):
+    for data, entry in zip(data_names(report), data_sets(report), strict=True):
         for row in entry["rows"]:
             facts = {
                 "table": report["table"],
-                "data": data_name(entry),
+                "data": data,
                 "number": row["number"],
                 "row": row["label"],
                 "built_on": row["built_on"] or "",

@@ -114,7 +114,7 @@ class AblationPlan:
     def work(self, trial: Trial) -> TrialJob:
         """What a process needs to know to run a trial."""
         store = self.out / STORE if self.shared else None
-        return TrialJob(trial, self.out, self.device, store, lpips=self.lpips, checkpoint_every=self.checkpoint_every)
+        return TrialJob(trial, self.device, store, lpips=self.lpips, checkpoint_every=self.checkpoint_every)
 
     @property
     def lpips(self) -> bool:
@@ -204,7 +204,7 @@ class Session:
                     self.watch.end(work.trial, outcome, self.report)
         for mesh in plan.meshes:
             (data,), (truth,) = plan.data, plan.truth
-            self.outcomes[mesh.folder(truth, plan.out)] = measured_mesh(mesh, truth, data, plan.out)
+            self.outcomes[mesh.folder(truth, data, plan.out)] = measured_mesh(mesh, truth, data, plan.out)
             self.save()
         return self.report
 
@@ -362,7 +362,7 @@ def report_of(plan: AblationPlan, every: Sequence[Trial], outcomes: Mapping[Path
                 "data": dump(replace(data, path=data.path.resolve())),
                 "truth": None if truth is None else {"path": str(truth.path), "tau": truth.tau},
                 "rows": rows_of(plan, [trial for trial in every if trial.data == data], outcomes)
-                + ([] if truth is None else mesh_rows(plan.meshes, truth, plan.out, outcomes, len(plan.table.rows))),
+                + ([] if truth is None else mesh_rows(plan, (data, truth), outcomes)),
                 "notes": notes_of(trial for trial in every if trial.data == data and trial.folder in outcomes),
             }
             for data, truth in plan.sets

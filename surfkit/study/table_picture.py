@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from surfkit.core.check import printable
 from surfkit.core.files import remove, replacing
 from surfkit.study.metric_columns import TABLE_COLUMNS
-from surfkit.study.table_text import caption, columns_of, data_name, data_sets
+from surfkit.study.table_text import caption, columns_of, data_names, data_sets
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +48,7 @@ def write_picture(path: Path, report: Mapping[str, Any]) -> bool:
         figure = Figure(size, PICTURE_DPI, layout="constrained")
         panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
         for axes, name in zip(panels, names, strict=True):
-            _panel(axes, name, entries, rows)
+            _panel(axes, name, dict(zip(data_names(report), entries, strict=True)), rows)
         labels = [_shortened(f"{row['label']}  (on {_number(entries, row['built_on'])})") for row in rows]
         panels[0].set_yticks(range(len(rows)), labels)
         panels[0].set_ylim(len(rows) - 0.5, -0.5)
@@ -68,10 +68,10 @@ def _panels(report: Mapping[str, Any]) -> list[str]:
     return [name for name in OF_QUALITY if name in found and name in shown][:MOST_PANELS]
 
 
-def _panel(axes: Axes, name: str, entries: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]) -> None:
-    """The bars of one column: those of several data sets side by side in each row."""
+def _panel(axes: Axes, name: str, entries: Mapping[str, Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]) -> None:
+    """The bars of one column: those of several data sets, by their names, side by side in each row."""
     column, height = TABLE_COLUMNS[name], 0.7 / len(entries)
-    for at, entry in enumerate(entries):
+    for at, (data, entry) in enumerate(entries.items()):
         by_label = {row["label"]: row for row in entry["rows"]}
         for place, row in enumerate(rows):
             step = by_label[row["label"]]["difference"].get(name)
@@ -79,7 +79,7 @@ def _panel(axes: Axes, name: str, entries: Sequence[Mapping[str, Any]], rows: Se
                 continue
             y = place + (at - (len(entries) - 1) / 2) * height
             what = "measured, kept" if row["kept"] else "measured, not kept"
-            told = what if len(entries) == 1 else f"{what}, {data_name(entry)}"
+            told = what if len(entries) == 1 else f"{what}, {data}"
             color = KEPT if row["kept"] else TRIED
             axes.barh(y, step["mean"], height, color=color, alpha=1 - 0.5 * at / len(entries), label=printable(told))
             if step["standard_error"] is not None:

@@ -50,9 +50,18 @@ def data_sets(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return list(report["data_sets"])
 
 
-def data_name(entry: Mapping[str, Any]) -> str:
-    """The name of the folder of a data set."""
-    return entry["data"]["path"].rpartition("/")[2]
+def data_names(report: Mapping[str, Any]) -> list[str]:
+    """The names of the data sets: of their folders, see `distinct_names`."""
+    return distinct_names([entry["data"]["path"] for entry in data_sets(report)])
+
+
+def distinct_names(paths: Sequence[str]) -> list[str]:
+    """The last part of each path, with as many parts before it as tell all of them apart: folders of photogrammetry
+    are often called alike, as site1/dense and site2/dense are."""
+    parts = [path.split("/") for path in paths]
+    lengths = range(1, max(map(len, parts), default=1) + 1)
+    tails = (["/".join(each[-length:]) for each in parts] for length in lengths)
+    return next((names for names in tails if len(set(names)) == len(names)), [each[-1] for each in parts])
 
 
 def columns_of(report: Mapping[str, Any]) -> list[str]:
@@ -127,8 +136,8 @@ def lines(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     paper, first = published_columns(report, names), data_sets(report)[0]["rows"]
     groups = [measured_cells(entry["rows"], names) for entry in entries] + [published_cells(first, paper)]
     head = ["", "row", "on", "seeds"]
-    for entry in entries:
-        head += [TABLE_COLUMNS[name].head + (f" {data_name(entry)}" if len(entries) > 1 else "") for name in names]
+    for data in data_names(report):
+        head += [TABLE_COLUMNS[name].head + (f" {data}" if len(entries) > 1 else "") for name in names]
     head += [f"paper: {TABLE_COLUMNS[name].head}" for name in paper]
     body = [
         [*names_of_row(report, at), *(str(cell) for group in groups for cell in group[at])] for at in indices(first)
@@ -159,8 +168,8 @@ def failures(report: Mapping[str, Any]) -> list[str]:
     entries = data_sets(report)
     many = len(entries) > 1
     return [
-        f"{row['label']}{f', {data_name(entry)}' if many else ''}: failed: {row['failed']}"
-        for entry in entries
+        f"{row['label']}{f', {data}' if many else ''}: failed: {row['failed']}"
+        for data, entry in zip(data_names(report), entries, strict=True)
         for row in entry["rows"]
         if row["failed"]
     ]
@@ -181,8 +190,8 @@ def note_lines(report: Mapping[str, Any]) -> list[str]:
     entries = data_sets(report)
     labels = [row["label"] for row in entries[0]["rows"]]
     return [
-        f"{row_numbers(note['rows'], labels)}{f', {data_name(entry)}' if len(entries) > 1 else ''}: {note['text']}"
-        for entry in entries
+        f"{row_numbers(note['rows'], labels)}{f', {data}' if len(entries) > 1 else ''}: {note['text']}"
+        for data, entry in zip(data_names(report), entries, strict=True)
         for note in entry["notes"]
     ]
 
@@ -190,7 +199,7 @@ def note_lines(report: Mapping[str, Any]) -> list[str]:
 def caption(report: Mapping[str, Any]) -> str:
     """What the table shows, and what of."""
     limit = f"; at most {report['max_points']:,} points, or as many in each block" if report["max_points"] else ""
-    data = ", ".join(data_name(entry) for entry in data_sets(report))
+    data = ", ".join(data_names(report))
     about = report["about"].rstrip(".")
     return f"{about}{about and '. '}Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}{limit}."
 
@@ -234,7 +243,7 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
         "row",
         "on",
         "seeds",
-        *_heads(entries, names),
+        *_heads(data_names(report), names),
         *(f"{TABLE_COLUMNS[n].head}\npaper" for n in beside),
     ):
         table.add_column(
@@ -254,9 +263,9 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
     return table
 
 
-def _heads(entries: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterable[str]:
-    for entry in entries:
-        yield from (TABLE_COLUMNS[name].head + (f"\n{data_name(entry)}" if len(entries) > 1 else "") for name in names)
+def _heads(data: Sequence[str], names: Sequence[str]) -> Iterable[str]:
+    for each in data:
+        yield from (TABLE_COLUMNS[name].head + (f"\n{each}" if len(data) > 1 else "") for name in names)
 
 
 def _stacked(cell: FormattedNumber, paper: FormattedNumber, style: str) -> Text:

@@ -1,15 +1,14 @@
-"""F1 of the meshes of an ablation table, all in one crop volume."""
+"""F1 of the meshes of an ablation table."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, read_json, write_json
+from surfkit.core.codec import dump
 from surfkit.evaluate.geometry.comparison import Comparison, truth_side
 from surfkit.evaluate.geometry.measure_geometry import measure_geometry
 from surfkit.evaluate.geometry.surface_file import read_surface
@@ -32,8 +31,6 @@ class Truth:
         path: A mesh, or a cloud of points.
         tau: Distance below which a point counts as right; None for what the spacing of a cloud gives.
         comparison: How they are compared, but for tau.
-        shares_crop: Whether all meshes are compared in the volume of the first. If not, each has the volume that the
-            views give, as high as the mesh itself: what comes out does not depend on what was measured before.
     """
 
     figure: ClassVar[str] = "f1"
@@ -42,7 +39,6 @@ class Truth:
     path: Path
     tau: float | None = None
     comparison: Comparison = PLAIN
-    shares_crop: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", self.path.resolve())
@@ -66,11 +62,6 @@ class Truth:
             return None
         return f"{state.st_size} {state.st_mtime_ns}"
 
-    def crop(self, out: Path) -> Path:
-        """Where the crop volume of all rows is kept in the folder of a table."""
-        digest = hashlib.sha256(f"{self.path} {self.tau} {self.stamp}".encode()).hexdigest()[:12]
-        return out / f"crop-{digest}.json"
-
     def known(self, metrics: Mapping[str, Any], compressed: bool = False) -> bool:
         """Whether the metrics of a run have the F1 of its mesh, or of that of its compressed model, against this.
 
@@ -81,24 +72,23 @@ class Truth:
         made = geometry.get("table")
         if not isinstance(made, dict) or self.stamp not in (None, made.get("truth")):
             return False
-        is_same = {name: it for name, it in made.items() if name != "truth"} == self._record
+        is_same = {name: it for name, it in made.items() if name != "truth"} == self.record
         return geometry.get("truth") == str(self.path) and is_same and "mesh" in own  # older versions have none
 
     @property
-    def _record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """Plain data by which figures that were measured otherwise are noticed."""
         other = {} if self.comparison == PLAIN else {"comparison": dump(self.comparison)}
-        return {"tau": self.tau, **other, **({} if self.shares_crop else {"shares_crop": False})}
+        # What has no "shares_crop" was measured in the volume of the row before it, which may end above a false ground.
+        return {"tau": self.tau, **other, "shares_crop": False}
 
-    def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
+    def measure(self, folder: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
 
-        Where the recipe compresses the model, it is the mesh of the compressed model, which is made here. The first run
-        that is measured decides the crop volume by its views; the others take it from there.
+        Where the recipe compresses the model, it is the mesh of the compressed model, which is made here.
 
         Args:
             folder: Of the run.
-            out: Of the table.
             device: For the depth of the compressed model.
 
         Raises:
@@ -108,29 +98,26 @@ class Truth:
         shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
         if not shown.mesh_record.exists():
             raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
-        found = self.compare(shown.mesh, shown.out / "geometry", out, read_unchanged(run))
+        found = self.compare(shown.mesh, shown.out / "geometry", read_unchanged(run))
         metrics = note_metrics(shown.metrics, found)
         return metrics if shown is run else note_compressed(run, metrics)
 
-    def compare(self, mesh: Path, folder: Path, out: Path, scene: Scene) -> dict[str, Any]:
-        """What metrics.json is to say of a mesh in the frame of a scene, against this, in the volume of the table.
+    def compare(self, mesh: Path, folder: Path, scene: Scene) -> dict[str, Any]:
+        """What metrics.json is to say of a mesh in the frame of a scene, against this.
+
+        The volume that the views give is the same for all meshes in plan, and as high as each: what comes out does not
+        depend on what was measured before, and a false ground below that of the other rows counts.
 
         Args:
             mesh: The file.
             folder: Gets pictures and clouds.
-            out: Of the table.
-            scene: Whose views decide the volume, if none is kept yet.
+            scene: Whose views decide the volume.
 
         Raises:
             BadInput: The mesh is nowhere near the truth.
         """
-        crop = self.crop(out)
-        is_known = self.shares_crop and crop.exists()
-        settings = replace(self.settings, crop=str(crop)) if is_known else self.settings
-        found = measure_geometry((mesh, self.path), settings, folder, scene.train, scene.frame)
-        found["geometry"]["table"] = {**self._record, "truth": self.stamp}
-        if self.shares_crop and not crop.exists():
-            write_json(crop, read_json(folder / "crop.json", Any))
+        found = measure_geometry((mesh, self.path), self.settings, folder, scene.train, scene.frame)
+        found["geometry"]["table"] = {**self.record, "truth": self.stamp}
         return found
 
 

@@ -227,6 +227,25 @@ def test_a_mesh_by_itself(tmp_path, capsys):
     assert "half of them within 11.3 degrees" in said and "non-manifold edges" in said
 
 
+def test_figures_of_another_mesh_do_not_stay_beside_those_of_this_one(tmp_path, capsys):
+    mesh, truth = ridges(tmp_path)
+    options = ("--gt", truth, "--tau", 0.1, "--crop", "none", "--align", "none", "--draws", 1, "--no-classes")
+
+    def kept():
+        return set(json.loads((tmp_path / "ridges-geometry" / "metrics.json").read_text()))
+
+    assert spoken(capsys, mesh, *options)[0] == 0 and spoken(capsys, mesh)[0] == 0
+    assert kept() == {"mesh", "geometry"}, "of the same mesh"
+    other = trimesh.load(mesh, process=False)
+    trimesh.Trimesh(other.vertices, other.faces[:-1], process=False).export(mesh)
+    status, _, told = spoken(capsys, mesh)
+    assert status == 0 and kept() == {"mesh"} and "F1 were of another mesh and are gone" in told
+    assert spoken(capsys, mesh, *options)[0] == 0
+    x, y = (each.ravel() for each in np.meshgrid(*[np.arange(-4, 4, 0.05)] * 2))
+    write_points(mesh, np.stack([x, y, 0 * x], 1), np.zeros((len(x), 3), np.uint8))
+    assert spoken(capsys, mesh, *options)[0] == 0 and kept() == {"geometry"}, "a cloud has no mesh by itself"
+
+
 def test_roughness_where_the_truth_is_plane(tmp_path, capsys, monkeypatch):
     """Heights between 0 and h, all as often, have a standard deviation of h over the root of 12."""
     from surfkit.evaluate.mesh import roughness

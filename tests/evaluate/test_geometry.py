@@ -54,6 +54,18 @@ def only_given(monkeypatch):
     monkeypatch.setattr(comparison, "ALIGNMENTS", ("none",))
 
 
+def test_coordinates_that_are_rounded_too_far_are_told(only_given, warned):
+    place = np.array([512000.0, 5412000.0, 100.0])
+    truth = surface(lattice(place))
+    compare(truth, truth, still(tau=0.4))
+    assert not warned
+    rounded = SurfaceFile("given", truth.rows.astype(np.float32))
+    compare(rounded, truth, still(tau=4.0))
+    assert not warned, "steps are small against tau"
+    compare(rounded, truth, still(tau=0.2))
+    assert "given: its coordinates are numbers of 32 bits, at the largest ones 0.5 apart" in warned[0]
+
+
 @pytest.mark.parametrize("align", ["none", "rigid", "similarity"])
 def test_the_truth_against_itself(align):
     assert f1(compare(GLOBE, GLOBE, still(align=align, tau=0.4))) == (1, 1, 1)

@@ -1,6 +1,7 @@
 """Meshes and clouds from files of every kind, and what is wrong with bad ones."""
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from surfkit.evaluate.geometry.file_transform import same_plan
 from surfkit.evaluate.geometry.height_systems import HeightSystem
 from surfkit.evaluate.geometry.las import read_las
 from surfkit.evaluate.geometry.sampling import face_areas
-from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface, system_of
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, read_surface, rounding, system_of
 from surfkit.evaluate.geometry.top_surface import highest
 from surfkit.io.splats.ply import write_points
 
@@ -67,6 +68,20 @@ def test_text_files(tmp_path):
     )
     cloud = read_surface(tmp_path / "cloud.ply")
     assert cloud.faces is None and cloud.vertices().tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_a_text_keeps_all_digits_of_coordinates(tmp_path):
+    corners = np.array([[512345.12, 5412345.34, 100.5], [512346.12, 5412345.34, 100.5], [512345.12, 5412346.34, 100.5]])
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float32 y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path = tmp_path / "text.ply"
+    path.write_text(head + "\n".join(" ".join(f"{it:.2f}" for it in row) for row in corners) + "\n3 0 1 2\n")
+    assert np.array_equal(read_surface(path).vertices(), corners)
+    assert rounding(read_surface(path)) == 0
+    short = SurfaceFile(path, corners.astype(np.float32), np.array([[0, 1, 2]]))
+    assert rounding(short) == 0.5 and rounding(replace(short, rows=short.rows.astype(float))) == 0.5
+    offset = replace(short, rows=(corners - corners[0]).astype(np.float32), offset=tuple(corners[0]))
+    assert rounding(offset) < 1e-6, "what the file leaves out is not rounded"
 
 
 def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, warned):
@@ -238,6 +253,10 @@ def test_noise_and_withheld_points_of_a_scan_are_no_surface(tmp_path, version, k
     found = read_surface(tmp_path / "a.las").vertices()
     assert found.shape == PLACES[good].shape and np.abs(found - PLACES[good]).max() < 1e-3
     assert len(warned) == 1 and f"{(~good).sum()} points are left out, which the file calls noise" in warned[0]
+    made.withheld[:] = 1
+    made.write(tmp_path / "a.las")
+    with pytest.raises(BadInput, match="no points in it but 2,000 of noise"):
+        read_surface(tmp_path / "a.las")
 
 
 def test_a_file_that_is_no_scan_is_refused(tmp_path):

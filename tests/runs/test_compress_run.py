@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from surfkit.apps.run_summary import compressed_rows
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.compress.base import Compressor
@@ -238,3 +239,16 @@ def test_bisection_finds_the_largest_errors_that_fit():
 
     found = fitted(Known(), CompressionTarget(bytes=300), lambda path, tried: 1000 / tried.factor)
     assert 3.333 <= found.factor < 3.6
+
+
+def test_f1_of_other_thresholds_stand_not_side_by_side():
+    """Nor are there figures that only another protocol has: that of DTU has no F1."""
+    record = {"ply_bytes": 100, "bytes": 10, "points": 1}
+    whole = {"images": {}, "geometry": {"f1": 0.9, "truth": "scan.ply", "tau": 0.5}}
+
+    def told(**others):
+        rows = compressed_rows(record, whole | {"compressed": {"images": {}, "geometry": whole["geometry"] | others}})
+        return [row[1:] for row in rows if row[0] == "F1"]
+
+    assert told(f1=0.8) == [("0.9000", "0.8000 (-0.1000)")]
+    assert told(f1=0.8, tau=0.25) == told(f1=0.8, truth="mesh.ply") == told(f1=None) == []

@@ -226,6 +226,9 @@ def test_rows_are_picked_by_number_or_label():
     for wrong in ("0", "4", "strt"):
         with pytest.raises(BadInput, match=f"no row .*'{wrong}'.*known: start, given up, end; .* 1 to 3"):
             pick(FALLBACKS, [wrong])
+    degrees = Table("degrees", "", COARSE_BASELINE, tuple(Row(f"{n}", {"primitive.sh_degree": n}) for n in range(4)))
+    assert pick(degrees, ["2"]) == ["2"], "the row of that name, which is the third"
+    assert pick(degrees, ["4"]) == ["3"]
 
 
 def test_a_row_may_be_a_recipe_of_its_own():
@@ -234,6 +237,18 @@ def test_a_row_may_be_a_recipe_of_its_own():
     built = build(Table("mixed", "Rows of two kinds.", COARSE_BASELINE, rows))
     assert replace(built["other"], about=other.about) == evolve(other, "primitive.sh_degree", 0)
     assert replace(built["next"], about=other.about) == evolve(evolve(other, "primitive.sh_degree", 0), "seed", 7)
+
+
+def test_no_row_builds_on_those_that_another_package_adds():
+    tail = (Row("c", {"seed": 3}, kept=False), Row("alone", {"primitive.sh_degree": 0}, group=ablation.BASELINE))
+    own = Table("mine", "", COARSE_BASELINE, (Row("a", {"seed": 1}), Row("b", {"seed": 2}), *tail))
+    first = ablation.with_rows_of_others(own, (Row("x", {"seed": 7}), Row("y", {"primitive.sh_degree": 1})), own)
+    both = ablation.with_rows_of_others(first, (Row("z", {"primitive.sh_degree": 1}),), own)
+    assert built_on(both) == {"a": None, "b": "a", "c": "b", "x": "b", "y": "x", "z": "b", "alone": "b"}
+    assert {label: build(both)[label] for label in build(own)} == build(own)
+    aside = replace(own, rows=(replace(own.rows[0], kept=False), replace(tail[1], kept=False)))
+    both = ablation.with_rows_of_others(aside, (Row("x", {"seed": 7}),), aside)
+    assert built_on(both) == {"a": None, "x": None, "alone": None}
 
 
 def test_packages_add_rows_to_tables_of_others(monkeypatch):
@@ -251,7 +266,8 @@ def test_packages_add_rows_to_tables_of_others(monkeypatch):
     finally:
         reload()
     rows = tables["methods"].rows
-    assert rows[: len(METHODS_TABLE.rows)] == METHODS_TABLE.rows and rows[-1] == Row("ours", {"seed": 3})
+    assert rows[: len(METHODS_TABLE.rows)] == METHODS_TABLE.rows
+    assert rows[-1] == Row("ours", {"seed": 3}, on=next(row.label for row in reversed(METHODS_TABLE.rows) if row.kept))
     labels = [row.label for row in tables["trim"].rows]
     assert labels[-2:] == ["ours", "stereo alone"], "what has no splats stays apart from what has"
     assert "lost" not in tables

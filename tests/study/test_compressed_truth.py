@@ -44,6 +44,8 @@ def test_its_mesh_is_made_and_measured_once(tmp_path):
     plain, small = rows_in(ablate(plan, Silent()))
     assert plain["failed"] is None and small["failed"] is None, (plain["failed"], small["failed"])
     assert plain["mean"]["f1"] > 0.99 and 0 <= small["mean"]["f1"] < plain["mean"]["f1"]
+    assert small["mean"].keys() == plain["mean"].keys(), "no column of the mesh is missing"
+    assert 0 < plain["mean"]["chamfer"] < small["mean"]["chamfer"]
     folder = out / small["runs"][0]["folder"]
     assert (folder / "compressed" / "mesh.ply").exists()
     noted = json.loads((folder / "metrics.json").read_text())

@@ -195,7 +195,7 @@ def kill_and_continue(data: Data, out: Path) -> int:
 
 def test_a_worker_whose_driver_is_gone_stops(table, data, tmp_path, monkeypatch):
     (trial,) = trials(AblationPlan(table, (data,), tmp_path, rows=("1",)))[:1]
-    job = rows.job_of(0, TrialJob(trial, tmp_path, "cpu"))
+    job = rows.job_of(0, TrialJob(trial, "cpu"))
     monkeypatch.setenv("SURFKIT_DRIVER", "1" if os.getppid() != 1 else "2")
 
     def forever(work):
@@ -208,7 +208,7 @@ def test_a_worker_whose_driver_is_gone_stops(table, data, tmp_path, monkeypatch)
 
 def test_what_becomes_of_a_process_that_dies(table, data, tmp_path):
     trial = trials(AblationPlan(table, (data,), tmp_path))[0]
-    work = TrialJob(trial, tmp_path)
+    work = TrialJob(trial)
     job = Job(0, trial.folder, lambda: 0, ())
     assert outcome_of(work, JobResult(job, -9, kind="oom")).failed == (
         f"its process ended by SIGKILL while memory ran out; see {trial.folder / 'log.txt'}"

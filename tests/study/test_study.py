@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -275,7 +277,7 @@ def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs,
         ablate(plan, Silent())
 
 
-def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp_path, capsys):
+def test_f1_of_every_row_in_a_volume_of_its_own(data, runs, monkeypatch, tmp_path, capsys):
     from surfkit.study import truth
 
     calls = []
@@ -312,7 +314,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
     assert [row["mean"]["f1"] for row in rows_in(report)] == [0.25, 0.25, 0.5]
     assert rows_in(report)[2]["difference"]["f1"]["mean"] == 0.25
     assert capsys.readouterr().err.count("counting the views of each point") == 2, "it takes minutes"
-    assert calls == ["auto", str(plan.truth[0].crop(plan.out))], "the second row is measured in the volume of the first"
+    assert calls == ["auto", "auto"], "no row is measured in the volume of another"
     assert "| **0.500** (+0.250) | **100** (-66.7 %) | 1.5 (+0.0 %) |" in (plan.out / "ablation.md").read_text()
     assert ablate(plan, Silent()) == report and len(calls) == 2 and len(runs.calls) == 2
     calls.append("bad")
@@ -415,7 +417,7 @@ def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):
 
     def metrics(truth):
         return {
-            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}},
+            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": truth.record | {"truth": truth.stamp}},
             "mesh": {},
         }
 
@@ -423,9 +425,12 @@ def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):
     assert not automatic.known(metrics(given)), "the threshold was given, and is now that of the spacing"
     assert not given.known({"geometry": {"f1": 0.9, "truth": str(file), "tau": 0.5, "align": "rigid"}}), "by evaluate"
     assert not given.known({"geometry": metrics(given)["geometry"]}), "by an older version, without the mesh by itself"
-    before, crop = metrics(given), given.crop(tmp_path)
+    before = metrics(given)
+    del before["geometry"]["table"]["shares_crop"]
+    assert not given.known(before), "by an older version, in the volume of the row that was measured first"
+    before = metrics(given)
     file.write_text("another truth")
-    assert not given.known(before) and given.crop(tmp_path) != crop
+    assert not given.known(before)
     file.unlink()
     assert given.known(before), "what was measured is shown where the truth is gone"
 
@@ -460,8 +465,20 @@ def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
     assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"
 
 
+def test_runs_on_folders_of_one_name_are_told_apart(data, runs, tmp_path, monkeypatch, capsys):
+    for name in ("north", "south"):
+        shutil.copytree(data.path, tmp_path / name / "dense")
+    (tmp_path / "here").symlink_to(tmp_path / "south" / "dense")
+    monkeypatch.chdir(tmp_path / "north" / "dense")
+    both = (Data(Path()), Data(tmp_path / "here"))
+    with AblationScreen(Console(file=io.StringIO())) as screen:
+        ablate(AblationPlan(TABLE, both, tmp_path / "out", rows=("base",)), screen)
+    said = capsys.readouterr().err
+    assert "base, seed 0 on north/dense, in" in said and "base, seed 0 on south/dense, in" in said
+
+
 def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
-    """They are measured once, in the volume that is kept, and stand below the rows; a bad one does not stop others."""
+    """They are measured once, and stand below the rows; a bad one does not stop others."""
     from surfkit.study import foreign_meshes as others
     from surfkit.study import truth
 
@@ -496,13 +513,15 @@ def test_meshes_of_other_programs_are_rows(data, monkeypatch, tmp_path):
         good["mean"]["components"] == 3 and good["mean"]["normals_p90"] == 30 and good["mean"]["crossing_share"] == 0.1
     )
     assert (bad["mean"], bad["failed"], bad["group"]) == ({}, "nowhere near", "") and base["failed"] is None
-    assert known.crop(plan.out).exists() and (plan.out / good["runs"][0]["folder"] / "metrics.json").exists()
+    assert (plan.out / good["runs"][0]["folder"] / "metrics.json").exists()
     text = (plan.out / "ablation.md").read_text()
     assert "| 2 | good |  | file |" in text and "| 10.000 % |" in text and "bad: failed: nowhere near" in text
     assert "normals" not in text, "which this table does not show"
     assert rows_in(report_so_far(plan))[1]["mean"] == good["mean"]
     ablate(plan, Silent())
     assert calls == ["good.ply", "bad.ply", "bad.ply"], "what is measured is not measured again"
+    wider = replace(plan, data=(replace(data, metres_per_unit=2.0),))
+    assert rows_in(report_so_far(wider))[1]["mean"] == {}, "in another unit"
     (tmp_path / "good.ply").write_text((tmp_path / "good.ply").read_text() + "\n")
     assert rows_in(report_so_far(plan))[1]["mean"] == {}, "another file"
 

@@ -13,7 +13,7 @@ from surfkit.study.latex import escape, latex
 from surfkit.study.recipes.ablations import COARSE_BASELINE
 from surfkit.study.row_comparison import compare
 from surfkit.study.runs_csv import comma_separated
-from surfkit.study.table_text import best_rows, columns_of, drawing, failures, lines, markdown
+from surfkit.study.table_text import best_rows, columns_of, distinct_names, drawing, failures, lines, markdown
 
 TABLE = Table(
     "looks",
@@ -30,7 +30,7 @@ TABLE = Table(
 PSNR = {"base": 20.0, "+ more": 21.004, "+ aside": 25.0, "other | kind": 19.0, "last": 19.0}
 
 
-def report_of(columns=(), others=(), failed=None):
+def report_of(columns=(), others=(), failed=None, first="/data/first_town"):
     """A finished table with seeds 0 and 1: PSNR as above and 1 dB more."""
 
     def entry(path, more):
@@ -51,7 +51,7 @@ def report_of(columns=(), others=(), failed=None):
         ]
         return {"data": {"path": path}, "truth": None, "rows": rows, "notes": []}
 
-    entries = [entry("/data/first_town", 0.0), *(entry(f"/data/{name}", 1.0) for name in others)]
+    entries = [entry(first, 0.0), *(entry(f"/data/{name}", 1.0) for name in others)]
     known = {"table": "looks", "about": TABLE.about, "steps": 300, "max_points": None, "seeds": 2}
     return known | {"columns": list(columns), "data_sets": entries}
 
@@ -107,6 +107,19 @@ def test_several_data_sets_stand_side_by_side():
     assert [line["data"] for line in csv.DictReader(io.StringIO(comma_separated(report)))] == ["first_town"] * 10 + [
         "village"
     ] * 10
+
+
+def test_data_sets_in_folders_of_one_name_are_told_apart():
+    report = report_of(first="/data/north/dense", others=["south/dense"], failed="no disk")
+    assert lines(report)[0][4:6] == ["PSNR north/dense", "points north/dense"]
+    assert "PSNR south/dense" in markdown(report) and "Data: north/dense, south/dense" in markdown(report)
+    assert "last, south/dense: failed" in "".join(failures(report))
+    assert "south/dense" in latex(report) and "south/dense" in printed(report, width=300)
+    assert {row["data"] for row in csv.DictReader(io.StringIO(comma_separated(report)))} == {
+        "north/dense",
+        "south/dense",
+    }
+    assert distinct_names(["/a/x", "/a/y"]) == ["x", "y"] and distinct_names(["/x", "/a/x"]) == ["/x", "a/x"]
 
 
 def test_a_terminal_marks_the_running_row_and_shows_what_is_published_below():

@@ -100,7 +100,7 @@ class SurfaceTruth(TruthFiles):
             out.mkdir(parents=True, exist_ok=True)
             write_transform(out / "transform.txt", np.diag([self.per_unit] * 3 + [1.0]))
             comparison = replace(comparison, transform=(out / "transform.txt").resolve())
-        return Truth(root / self.file.path, self.tau, comparison, shares_crop=False)
+        return Truth(root / self.file.path, self.tau, comparison)
 
     def check(self, root: Path) -> None:
         """See `TruthFiles.check`."""
@@ -158,7 +158,7 @@ class TanksTruth(TruthFiles):
         comparison = replace(
             PLAIN, transform=(out / "transform.txt").resolve(), crop=str((root / self._name(".json")).resolve())
         )
-        return Truth(root / self._name(".ply"), self.tau, comparison, shares_crop=False)
+        return Truth(root / self._name(".ply"), self.tau, comparison)
 
     def check(self, root: Path) -> None:
         """See `TruthFiles.check`."""
@@ -207,7 +207,7 @@ class DTUTruthFiles(TruthFiles):
     def truth(self, root: Path, out: Path, scene: Scene) -> Truth:
         """See `TruthFiles.truth`."""
         masks, scale, scan, seen, plane = (root / each.path for each in self.needed())
-        found = DTUTruth(scan, shares_crop=False, observability=seen, plane=plane, scale=scale, masks=masks)
+        found = DTUTruth(scan, observability=seen, plane=plane, scale=scale, masks=masks)
         found.silhouettes(len(scene.train) + len(scene.held_out))
         return found
 

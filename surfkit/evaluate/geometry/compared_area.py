@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from surfkit.evaluate.geometry.repetition import Box
 from surfkit.evaluate.geometry.surface_file import SurfaceFile, system_of
-from surfkit.evaluate.geometry.transform import apply, scale_of
+from surfkit.evaluate.geometry.transform import apply, scale_of, seen_from
 from surfkit.io.area import Area, read_area
 from surfkit.io.polygon_file import Site
 from surfkit.scene.crop import Axis
@@ -63,9 +62,3 @@ def extent(blocks: Iterable[np.ndarray]) -> Box:
     for block in blocks:
         low, high = np.minimum(low, block.min(0, initial=np.inf)), np.maximum(high, block.max(0, initial=-np.inf))
     return low, high
-
-
-def seen_from(matrix: np.ndarray, box: Box) -> Box:
-    """The box about the corners of a box in another frame."""
-    corners = apply(matrix, np.array(list(product(*zip(*box, strict=True)))))
-    return corners.min(0), corners.max(0)

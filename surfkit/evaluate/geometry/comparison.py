@@ -11,7 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.evaluate.geometry.compared_area import compared_area, seen_from
+from surfkit.evaluate.geometry.compared_area import compared_area
 from surfkit.evaluate.geometry.presets import PRESETS, PresetName
 from surfkit.evaluate.geometry.registration import ICP_ROUNDS
 from surfkit.evaluate.geometry.repetition import (
@@ -23,14 +23,15 @@ from surfkit.evaluate.geometry.repetition import (
     cloud_side,
     mesh_side,
     refuse_few,
+    warn_if_rounded,
     warn_if_sparse,
 )
 from surfkit.evaluate.geometry.scores import shares, spacing, tree
 from surfkit.evaluate.geometry.surface_file import SurfaceFile
-from surfkit.evaluate.geometry.transform import read_transform, scale_of
+from surfkit.evaluate.geometry.transform import read_transform, scale_of, seen_from
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
 from surfkit.io.area import Area, require_area
-from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
+from surfkit.scene.crop import Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5
@@ -227,8 +228,9 @@ def compare(
     ours = make_side(reconstruction, None, settings.samples, own_tau, own_box)
     if theirs.sparse is not None:
         theirs = make_side(truth, None, settings.samples, tau, box)
-    warn_if_sparse(ours, own_tau)
-    warn_if_sparse(theirs, tau)
+    for side, surface, length in ((ours, reconstruction, own_tau), (theirs, truth, tau)):
+        warn_if_sparse(side, length)
+        warn_if_rounded(surface, length)
     draws: list[RepetitionResult] = []
     others: dict[str, RepetitionResult | None] = {}
     done, total = 0, len(ALIGNMENTS) + settings.draws - 1
@@ -302,10 +304,7 @@ def around(crop: Crop | None, area: Box | None, tau: float) -> Box | None:
     room = ICP_ROUNDS[0][1] * tau
     if crop is None:
         return None if area is None else (area[0] - room, area[1] + room)
-    plane, along = list(PLANES[crop.axis]), "xyz".index(crop.axis)
-    low, high = np.empty(3), np.empty(3)
-    low[plane], high[plane] = crop.polygon.min(0), crop.polygon.max(0)
-    low[along], high[along] = crop.low, crop.high
+    low, high = crop.ends
     if area is not None:
         low, high = np.maximum(low, area[0]), np.minimum(high, area[1])
     return low - room, high + room

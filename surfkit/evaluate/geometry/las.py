@@ -67,10 +67,10 @@ def read_las(path: Path, most: int = MAX_POINTS) -> tuple[np.ndarray, np.ndarray
     with _opened(path) as file:
         xyz, rgb, left = _points(file, most)
         notes, count = _notes(path, file.header), file.header.point_count
+    if not len(xyz):
+        raise BadInput(f"{path}: there are no points in it" + (f" but {left:,} of noise" if left else ""))
     if left:
         emit(Warned(f"{path}: {left:,} points are left out, which the file calls noise or withheld"))
-    if not len(xyz):
-        raise BadInput(f"{path}: there are no points in it")
     _tell_fewer(path, len(xyz) + left, count)
     return xyz, rgb, notes
 

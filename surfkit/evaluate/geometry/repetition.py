@@ -15,7 +15,7 @@ from surfkit.core.memory import size
 from surfkit.evaluate.geometry.registration import IcpResult, align
 from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
 from surfkit.evaluate.geometry.scores import WORKERS, Distances, nearest, tree
-from surfkit.evaluate.geometry.surface_file import SurfaceFile, part_within
+from surfkit.evaluate.geometry.surface_file import SurfaceFile, part_within, rounding
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
@@ -38,6 +38,8 @@ UNTOLD_SIZE = 1e-3
 """Change of size by ICP that is taken as it is; a larger one must gain."""
 MIN_COMPARED_POINTS = 10
 """Points on either side without which shares mean nothing."""
+MAX_ROUNDING_TAUS = 0.25
+"""Step between coordinates, as a share of tau, up to which rounding decides nothing."""
 SAMPLE_BYTES = 200
 """Memory for a point that is drawn from a mesh; as much again for one of the other side."""
 Box = tuple[np.ndarray, np.ndarray]
@@ -144,6 +146,17 @@ def warn_if_sparse(side: ComparedSurface, tau: float) -> None:
             Warned(
                 f"{side.surface.path}: its {side.count} samples lie further apart than 0.7 times tau ({tau:.3g}), so "
                 f"right surfaces count as missing; give a larger --tau, a smaller --crop, or --samples {side.sparse}"
+            )
+        )
+
+
+def warn_if_rounded(surface: SurfaceFile, tau: float) -> None:
+    """Warn of coordinates, such as those of a map in a file of 32 bits, that are too far apart for the threshold."""
+    if (step := rounding(surface)) > MAX_ROUNDING_TAUS * tau:
+        emit(
+            Warned(
+                f"{surface.path}: its coordinates are numbers of 32 bits, at the largest ones {step:.3g} apart, "
+                f"which is much for a tau of {tau:.3g}: take a file of 64 bits, or one near its origin, and --transform"
             )
         )
 

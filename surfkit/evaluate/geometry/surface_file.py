@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -231,7 +234,8 @@ def _other(path: Path) -> SurfaceFile:
     with needed("trimesh", f"{path}: a file that is not binary PLY"):
         import trimesh
     try:
-        loaded = trimesh.load(path, process=False)
+        source = _with_doubles(path) if path.suffix.lower() == ".ply" else path
+        loaded = trimesh.load(source, file_type=path.suffix.lower().removeprefix("."), process=False)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
     except Exception as error:  # trimesh's readers raise whatever their parsing runs into
@@ -242,6 +246,25 @@ def _other(path: Path) -> SurfaceFile:
     place = place_of(path, root_of(path))
     vertices = np.asarray(vertices, np.float64) @ place.turn.T + place.offset
     return SurfaceFile(path, vertices, None if faces is None else np.asarray(faces))
+
+
+def _with_doubles(path: Path) -> BinaryIO:
+    """A PLY file; in that of a text, coordinates are called doubles: trimesh would round those of a map to half a
+    metre, while the text has all their digits."""
+    head, end, rest = path.read_bytes().partition(b"end_header")
+    if re.search(rb"^format ascii ", head, re.MULTILINE):
+        head = re.sub(rb"^property float(32)? (?=[xyz]\s*$)", b"property double ", head, flags=re.MULTILINE)
+    return io.BytesIO(head + end + rest)
+
+
+def rounding(surface: SurfaceFile) -> float:
+    """Step between neighbouring numbers at the largest coordinate, in units of the file, where all coordinates are
+    numbers of 32 bits, whatever the file calls them; 0 where they have more digits."""
+    some = surface.vertices(slice(None, None, max(1, len(surface) // BLOCK_POINTS))) - surface.offset
+    some = some[np.isfinite(some).all(1)]
+    if not len(some) or (some.astype(np.float32) != some).any():
+        return 0.0
+    return float(np.spacing(np.abs(some).max().astype(np.float32)))
 
 
 def _sound(found: SurfaceFile) -> SurfaceFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ MAX_SIMILARITY_ERROR = 1e-3
 def apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(n, 3) float64 of (n, 3) points after a (4, 4) matrix."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def seen_from(matrix: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The box, as (3,) least and greatest coordinates, about the corners of a box in another frame."""
+    corners = apply(matrix, np.array(list(product(*zip(*box, strict=True)))))
+    return corners.min(0), corners.max(0)
 
 
 def scale_of(matrix: np.ndarray) -> float:

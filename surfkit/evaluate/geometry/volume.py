@@ -12,8 +12,8 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.point_visibility import visible_counts
 from surfkit.evaluate.geometry.scores import surface_gap, tree
-from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, SurfaceFile
-from surfkit.evaluate.geometry.transform import apply, scale_of
+from surfkit.evaluate.geometry.surface_file import BLOCK_POINTS, BOX_PIECES, SurfaceFile, part_within
+from surfkit.evaluate.geometry.transform import apply, scale_of, seen_from
 from surfkit.io.area import Area
 from surfkit.scene.crop import PLANES, Axis, Crop, within
 from surfkit.scene.scene import Frame, View
@@ -88,12 +88,29 @@ def heightened(
     """
     low, high, axis = crop.low, crop.high, "xyz".index(crop.axis)
     wide = float(np.linalg.norm(np.ptp(crop.polygon, axis=0)))
-    for block in reconstruction.blocks():
+    for block in _reaching(reconstruction, matrix, replace(crop, low=low - wide, high=high + wide)):
         moved = apply(matrix, block)
         moved = moved[(moved[:, axis] > crop.low - wide) & (moved[:, axis] < crop.high + wide)]
         along = moved[_over(crop, area, moved), axis]
         low, high = min(low, along.min(initial=low)), max(high, along.max(initial=high))
     return replace(crop, low=low - room * (low < crop.low), high=high + room * (high > crop.high))
+
+
+def _reaching(surface: SurfaceFile, matrix: np.ndarray, crop: Crop) -> Iterator[np.ndarray]:
+    """(n, 3) places by which a surface reaches into a volume: its points, and the middles of the pieces of large faces,
+    which may go through the volume without a corner in it, as the closing faces of Poisson surfaces do."""
+    yield from surface.blocks()
+    if surface.faces is None:
+        return
+    low, high = crop.ends
+    low, high = seen_from(np.linalg.inv(matrix), (low, high))
+    size = float(np.linalg.norm(high - low)) / BOX_PIECES
+    for start in range(0, len(surface.faces), BLOCK_POINTS):
+        faces = np.asarray(surface.faces[start : start + BLOCK_POINTS])
+        corners = surface.vertices(faces.ravel()).reshape(-1, 3, 3)
+        large = faces[np.ptp(corners, axis=1).max(1) > size]
+        if len(large):
+            yield part_within(replace(surface, faces=large), low, high).rows.reshape(-1, 3, 3).mean(1)
 
 
 def _over(crop: Crop, area: Area | None, points: np.ndarray) -> np.ndarray:

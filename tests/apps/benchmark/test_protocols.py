@@ -128,7 +128,7 @@ def test_a_folder_of_tanks_and_temples(tmp_path):
     assert np.allclose(
         apply(read_transform(truth.comparison.transform), points), (points * 2 + [1, 2, 3]) * 3, atol=1e-6
     )
-    assert truth.tau == 0.01 and truth.comparison.crop.endswith("Barn/Barn.json") and not truth.shares_crop
+    assert truth.tau == 0.01 and truth.comparison.crop.endswith("Barn/Barn.json")
 
 
 def test_a_scan_of_dtu(tmp_path):
@@ -144,7 +144,7 @@ def test_a_scan_of_dtu(tmp_path):
     (tmp_path / "mesh.ply").write_text(head + faces + corners + "3 0 1 2\n3 0 2 3\n")
     found_scene = read(scene.data(tmp_path))
     truth = scene.truth.truth(tmp_path, tmp_path / "out", found_scene)
-    found = truth.compare(tmp_path / "mesh.ply", tmp_path / "geometry", tmp_path, found_scene)
+    found = truth.compare(tmp_path / "mesh.ply", tmp_path / "geometry", found_scene)
     chamfer = found["geometry"]["chamfer_dtu"]
     assert chamfer["accuracy"] == pytest.approx(3.0, abs=0.05), "0.3 units are 3 mm"
     assert chamfer["completeness"] == pytest.approx(3.0, abs=0.05)

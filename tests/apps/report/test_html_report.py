@@ -347,6 +347,17 @@ def test_figures_of_other_photographs_of_the_same_names_are_told(tmp_path):
     assert "or read them otherwise: data.path. Their figures may not compare." in page(*folders)[0]
 
 
+def test_surfaces_that_were_compared_otherwise_are_told(tmp_path):
+    folders = [plain_run(tmp_path / name) for name in ("one", "two", "three")]
+    for folder, tau in zip(folders, (0.5, 0.25, None), strict=True):
+        if tau is not None:
+            known = json.loads((folder / "metrics.json").read_text())
+            same = {"f1": 0.5, "truth": "/scan.ply", "align": "rigid", "crop": {"from": "auto"}}
+            write(folder / "metrics.json", known | {"geometry": same | {"tau": tau}})
+    assert "compared with the truth in several ways: tau: 0.25, 0.5. Their figures" in page(*folders)[0]
+    assert "in several ways" not in page(folders[0], folders[2])[0], "only one has a truth"
+
+
 def test_runs_of_one_name_are_told_apart(tmp_path):
     text, _ = page(plain_run(tmp_path / "x" / "run"), plain_run(tmp_path / "y" / "run"))
     assert f"{tmp_path}/x/run, {tmp_path}/y/run" in text

@@ -21,6 +21,7 @@ from surfkit.apps.report.json_values import (
 from surfkit.apps.report.run_files import RunFiles, read_source
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
+from surfkit.study.table_text import distinct_names
 
 ABLATION_FILE = "ablation.json"
 CAPTION = (
@@ -55,17 +56,17 @@ def _has_rows(entry: Any) -> bool:
     return isinstance(rows, list) and all(isinstance(value_at(row, "label"), str) for row in rows)
 
 
-def data_set_name(report: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
-    """What a data set is called where there are several; "" for the only one."""
-    path = value_at(entry, "data", "path")
-    return Path(path).name if isinstance(path, str) and len(report["data_sets"]) > 1 else ""
+def data_set_names(report: Mapping[str, Any]) -> list[str]:
+    """What the data sets are called where there are several; "" for the only one."""
+    paths = [value_at(entry, "data", "path") for entry in report["data_sets"]]
+    return distinct_names([path if isinstance(path, str) else "" for path in paths]) if len(paths) > 1 else [""]
 
 
 def row_runs(folder: Path, report: Mapping[str, Any]) -> dict[Place, RunFiles]:
     """The run of the first seed of each row that has one, by the positions of data set and row."""
     found: dict[Place, RunFiles] = {}
-    for which, entry in enumerate(report["data_sets"]):
-        beside = f", {name}" if (name := data_set_name(report, entry)) else ""
+    for which, (name, entry) in enumerate(zip(data_set_names(report), report["data_sets"], strict=True)):
+        beside = f", {name}" if name else ""
         for at, row in enumerate(entry["rows"]):
             runs = row.get("runs")
             where = value_at(runs[0], "folder") if isinstance(runs, list) and runs else None
@@ -80,9 +81,9 @@ def table_section(report: Mapping[str, Any], runs: Mapping[Place, RunFiles]) -> 
     changes."""
     rows = report["data_sets"][0]["rows"]
     elements: list[Element | None] = [Prose(_about(report))]
-    for which, entry in enumerate(report["data_sets"]):
+    for which, (name, entry) in enumerate(zip(data_set_names(report), report["data_sets"], strict=True)):
         own = {at: run for (there, at), run in runs.items() if there == which}
-        elements.append(_table(entry["rows"], own, data_set_name(report, entry)))
+        elements.append(_table(entry["rows"], own, name))
     elements += [_published(rows), _changes(rows)]
     return Section("table", "Table", tuple(element for element in elements if element is not None))
 

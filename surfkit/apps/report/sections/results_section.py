@@ -11,6 +11,15 @@ from surfkit.apps.report.run_files import RunFiles
 
 DEPTH_DATA = ("priors", "depth_layout", "depth_of")
 """Settings of the data set that say nothing of its photographs."""
+COMPARED_BY = {
+    "truth": ("truth",),
+    "tau": ("tau",),
+    "alignment": ("align",),
+    "preset": ("preset",),
+    "crop volume": ("crop", "from"),
+    "area": ("area", "file"),
+}
+"""What decides precision, recall and F1, and where metrics.json has it under "geometry"."""
 SEAM_PARTS = {"near": "near block borders", "elsewhere": "away from block borders"}
 
 
@@ -29,7 +38,7 @@ def results(runs: Sequence[RunFiles]) -> Section:
     caption = f"Figures of the runs, with the differences to {runs[0].name}"
     head = ("run", *(QUANTITIES[name].label for name in names))
     table = TableElement(caption, head, tuple(rows), is_sortable=True)
-    return Section("results", "Results", (*_of_other_data(runs), table))
+    return Section("results", "Results", (*_of_other_data(runs), *_compared_otherwise(runs), table))
 
 
 def _of_other_data(runs: Sequence[RunFiles]) -> tuple[Prose, ...]:
@@ -40,6 +49,17 @@ def _of_other_data(runs: Sequence[RunFiles]) -> tuple[Prose, ...]:
         return ()
     which = ", ".join(f"data.{name}" for name in names)
     return (Prose(f"The runs have other photographs, or read them otherwise: {which}. Their figures may not compare."),)
+
+
+def _compared_otherwise(runs: Sequence[RunFiles]) -> tuple[Prose, ...]:
+    """A warning where surfaces were not compared with the same truth in the same way."""
+    found = [geometry for run in runs if (geometry := mapping(run.metrics, "geometry"))]
+    ways = [{name: value_at(one, *path) or "none" for name, path in COMPARED_BY.items()} for one in found]
+    names = [name for name in COMPARED_BY if len(_values(ways, name)) > 1]
+    if not names:
+        return ()
+    told = "; ".join(f"{name}: {', '.join(sorted(_values(ways, name)))}" for name in names)
+    return (Prose(f"The surfaces were compared with the truth in several ways: {told}. Their figures do not compare."),)
 
 
 def _values(data: Sequence[dict[str, Any]], name: str) -> set[str]:
