@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import expect
+from surfkit.core.check import BadInput, expect
 from surfkit.densify.base import Signal
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.primitives.points import Columns
@@ -100,6 +100,11 @@ def _one_number(name: str, value: Any) -> Tensor:
     """What a loss gives, or BadInput that names the loss: what comes later could not tell which one it was."""
     if not isinstance(value, Tensor) or value.numel() != 1:
         expect(f"losses.{name}", value, ())
+    if not value.requires_grad and value.item():  # 0 is what a loss may say of a view that has no data for it
+        raise BadInput(
+            f"losses.{name}: its value {value.item():.4g} does not depend on what is drawn, so nothing is learnt from "
+            "it; compute it from the maps without detach(), item() or numpy(), or give 0"
+        )
     return value
 
 

@@ -23,7 +23,8 @@ class BrokenLoss(Loss):
 
     def __call__(self, maps, target):
         error = (maps.need("color") - target.photo).abs()
-        return {"float": 0.5, "image": error, "none": None}.get(self.how, error.mean())
+        given = {"float": 0.5, "image": error, "none": None, "detached": error.mean().detach(), "zero": torch.zeros(())}
+        return given.get(self.how, error.mean())
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ def scene(tmp_path_factory):
         ("pretrain.losses.mine", BrokenLoss("float"), r"losses.mine: expected shape \(\), got float"),
         ("pretrain.losses.mine", BrokenLoss("none"), r"losses.mine: expected shape \(\), got NoneType"),
         ("pretrain.losses.mine", BrokenLoss("image"), r"losses.mine: expected shape \(\), got \(3, 36, 48\)"),
+        ("pretrain.losses.mine", BrokenLoss("detached"), r"losses.mine: its value 0\.\d+ does not depend on what is"),
         ("pretrain.losses.mine", BrokenLoss("weight"), "losses.mine: its weight in step 1 is None"),
         ("pretrain.signal", BrokenSignal(), r"BrokenSignal.combine: expected shape \(\d+, 2\), got \(5, 2\)"),
         ("pretrain.signal", BrokenSignal("nan"), "BrokenSignal.combine: NaN or Inf, of gradients that are finite"),
@@ -107,6 +109,11 @@ def test_the_part_is_named(scene, tmp_path, slot, part, said):
     with pytest.raises(surfkit.BadInput, match=said) as error:
         surfkit.train(surfkit.evolve(surfkit.get_recipe("2dgs"), slot, part), scene, tmp_path / "run", steps=2)
     assert "\n" not in str(error.value)
+
+
+def test_a_loss_may_have_nothing_to_say(scene, tmp_path):
+    recipe = surfkit.evolve(surfkit.get_recipe("2dgs"), "pretrain.losses.mine", BrokenLoss("zero"))
+    assert len(surfkit.train(recipe, scene, tmp_path / "run", steps=2).splats.means)
 
 
 @pytest.fixture(scope="module")
