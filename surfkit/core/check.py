@@ -147,8 +147,8 @@ def expect_kind(name: str, value: Any, kind: type) -> None:
 
 
 @contextmanager
-def read_only(name: str, tensors: Mapping[str, Any]) -> Iterator[None]:
-    """Within, something is given tensors that it shall not change: BadInput if it does.
+def read_only(name: str, tensors: Mapping[str, Any], error: type[Exception] = BadInput) -> Iterator[None]:
+    """Within, something is given tensors that it shall not change: an error if it does.
 
     torch counts changes in place, so nothing is copied or compared, and no GPU is waited for. What goes around torch,
     through `.data` or an array of numpy, is not found.
@@ -156,6 +156,7 @@ def read_only(name: str, tensors: Mapping[str, Any]) -> Iterator[None]:
     Args:
         name: Of what is given them.
         tensors: By the names that messages call them.
+        error: `Fault` where somebody would go on after BadInput, with what has been changed.
     """
 
     def counts() -> dict[str, int]:
@@ -164,7 +165,7 @@ def read_only(name: str, tensors: Mapping[str, Any]) -> Iterator[None]:
     before = counts()
     yield
     if changed := [key for key, count in counts().items() if count != before[key]]:
-        raise BadInput(f"{name} changes {changed[0]} in place, which others read too; change a copy, as of clone()")
+        raise error(f"{name} changes {changed[0]} in place, which others read too; change a copy, as of clone()")
 
 
 def _written(shape: tuple[int | str, ...]) -> str:
