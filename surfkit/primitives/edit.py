@@ -191,11 +191,12 @@ def _refuse_out_of_range(name: str, edit: Edit) -> None:
     if most is not None and not (isinstance(most, (int, float)) and 0 < most < 1):
         raise BadInput(f"{name}: max_opacity is {str(most)[:40]}; it must be a number between 0 and 1")
     left = None if edit.drop is None else ~edit.drop
-    for field, wanted, fits in (
+    checks: tuple[tuple[str, str, Callable[[Tensor], Tensor]], ...] = (
         ("clone", "0 or more", lambda value: value >= 0),
         ("opacities", "between 0 and 1, or NaN", lambda value: value.isnan() | ((value > 0) & (value < 1))),
         ("scale_by", "finite and above 0", lambda value: (value > 0) & value.isfinite()),
-    ):
+    )
+    for field, wanted, fits in checks:
         value = getattr(edit, field)
         if value is None or value.dtype == torch.bool:
             continue
