@@ -269,7 +269,7 @@ def _append(file: BinaryIO, data: bytes) -> ChecksummedBlock:
 
 def _table_bytes(name: str, value: np.ndarray) -> bytes:
     if str(value.dtype) not in TABLE_TYPES:
-        raise TypeError(f"table {name}: {value.dtype}; types are {', '.join(TABLE_TYPES)}")
+        raise BadInput(f"table {name}: {value.dtype}; types are {', '.join(TABLE_TYPES)}")
     rows = np.frombuffer(value.tobytes(), TABLE_TYPES[str(value.dtype)])
     return packed({"table": rows.reshape(table_shape(value.shape))})
 

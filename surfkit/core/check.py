@@ -121,5 +121,52 @@ def expect(name: str, array: Any, shape: tuple[int | str, ...], sizes: dict[str,
     raise BadInput(f"{name}: expected shape {_written(shape)}{known and f' with {known}'}, got {_written(got)}")
 
 
+def expect_tensor(
+    name: str, value: Any, kinds: Sequence[str], shape: tuple[int | str, ...], sizes: dict[str, int] | None = None
+) -> dict[str, int]:
+    """As `expect`, of a tensor of torch that has one of some types.
+
+    Args:
+        name: What the message calls it.
+        value: Anything.
+        kinds: Names of the types, such as "float32".
+        shape: See `expect`.
+        sizes: See `expect`.
+    """
+    library, _, kind = str(getattr(value, "dtype", "")).partition(".")
+    if library != "torch" or kind not in kinds:
+        came = f"a tensor of {kind}" if library == "torch" else type(value).__name__
+        raise BadInput(f"{name}: expected a tensor of {' or '.join(kinds)} of shape {_written(shape)}, got {came}")
+    return expect(name, value, shape, sizes)
+
+
+def expect_kind(name: str, value: Any, kind: type) -> None:
+    """BadInput unless a value is of a class."""
+    if not isinstance(value, kind):
+        raise BadInput(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+
+
+@contextmanager
+def read_only(name: str, tensors: Mapping[str, Any], error: type[Exception] = BadInput) -> Iterator[None]:
+    """Within, something is given tensors that it shall not change: an error if it does.
+
+    torch counts changes in place, so nothing is copied or compared, and no GPU is waited for. What goes around torch,
+    through `.data` or an array of numpy, is not found.
+
+    Args:
+        name: Of what is given them.
+        tensors: By the names that messages call them.
+        error: `Fault` where somebody would go on after BadInput, with what has been changed.
+    """
+
+    def counts() -> dict[str, int]:
+        return {key: value._version for key, value in tensors.items() if not value.is_inference()}
+
+    before = counts()
+    yield
+    if changed := [key for key, count in counts().items() if count != before[key]]:
+        raise error(f"{name} changes {changed[0]} in place, which others read too; change a copy, as of clone()")
+
+
 def _written(shape: tuple[int | str, ...]) -> str:
     return f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"

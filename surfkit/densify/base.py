@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from surfkit.core.check import expect_tensor
 from surfkit.core.lazy import Lazy
-from surfkit.core.registry import Component, find
+from surfkit.core.registry import Component, class_path, find
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
@@ -253,7 +254,9 @@ def admitted(filters: Sequence[Filter], step: Step, want: Tensor) -> Tensor:
     """(N,) bool, the points with a `want` above 0 that may be densified and pass one filter after the other."""
     want = want * step.may_be_densified()
     for condition in filters:
-        want = want * condition.admits(step, want)
+        admits = condition.admits(step, want)
+        expect_tensor(f"{class_path(type(condition))}.admits", admits, ("bool",), (len(want),))
+        want = want * admits
     return want > 0
 
 

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput, few
+from surfkit.core.check import BadInput, expect_kind, expect_tensor, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
-from surfkit.core.registry import name_of
+from surfkit.core.registry import class_path, name_of
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate, KnownSurfaces
 from surfkit.io.datasets.data import Data
@@ -201,6 +201,7 @@ class DepthPreparation:
         self.forget_other_work(given)
         begun = time.perf_counter()
         for estimate in self.estimator.estimate(given, wanted):
+            _refuse_unsound(f"{class_path(type(self.estimator))}.estimate", self.estimator, estimate, wanted)
             view = given.views[estimate.at]
             coverage = self.save(view, estimate, scene)
             yield EstimatedPhoto(view, coverage, time.perf_counter() - begun)
@@ -226,6 +227,22 @@ class DepthPreparation:
         normal = None if estimate.normal is None else estimate.normal.numpy()
         write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > MIN_TRUSTED_CONFIDENCE).float().mean())
+
+
+def _refuse_unsound(where: str, estimator: DepthEstimator, estimate: Any, wanted: Sequence[int]) -> None:
+    """BadInput unless an estimate is of a wanted view, with maps that belong together: a wrong position would give a
+    photograph the depth of another, and maps of other shapes would be thrown away in each run, and made again."""
+    expect_kind(where, estimate, Estimate)
+    if estimate.at not in wanted:
+        raise BadInput(f"{where}: at is {estimate.at}, no position of a view that was asked for")
+    if estimate.inverse is None or estimate.confidence is None:
+        return
+    sizes = expect_tensor(f"{where}: inverse", estimate.inverse, ("float32",), ("h", "w"))
+    expect_tensor(f"{where}: confidence", estimate.confidence, ("float32",), ("h", "w"), sizes)
+    if estimate.normal is not None:
+        expect_tensor(f"{where}: normal", estimate.normal, ("float32",), (3, "h", "w"), sizes)
+    if estimator.aligned and bool((estimate.inverse < 0).any()):
+        raise BadInput(f"{where}: inverse is below 0; give that of camera z, and 0 where there is none")
 
 
 def made_from(given: DepthInput, estimator: DepthEstimator) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, expect
 from surfkit.core.registry import Component
 from surfkit.raster.api import Splats
 from surfkit.raster.base import Rasterizer
@@ -37,6 +37,12 @@ class Ground:
 
     x: tuple[float, float, float]
     y: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        apart = torch.tensor([self.x, self.y], dtype=torch.float64)
+        expect("ground", apart, (2, 3))
+        if not torch.allclose(apart @ apart.T, torch.eye(2, dtype=torch.float64), atol=1e-4):
+            raise BadInput(f"ground: axes {self.x} and {self.y}; they must have length 1 and be perpendicular")
 
     @classmethod
     def under(cls, centres: Tensor, points: Tensor) -> Ground:
@@ -127,6 +133,29 @@ class Cells:
         if not self.boxes:
             raise BadInput("cells: there are none")
 
+    def refuse_untiled(self, where: str) -> None:
+        """BadInput unless every place is in exactly one cell: one in two would belong to the block of the last.
+
+        Args:
+            where: Begins messages.
+        """
+        if not all(type(block) is int for block in self.blocks):
+            raise BadInput(f"{where}: blocks are {self.blocks}; give whole numbers, counted from 0")
+        for at, box in enumerate(self.boxes):
+            ends = [end is None or (isinstance(end, (int, float)) and abs(end) < math.inf) for end in box]
+            if len(ends) != 4 or not all(ends):
+                raise BadInput(f"{where}: box {at} is {box}; give lower x and y, upper x and y, numbers or None")
+            sides = ((box[0], box[2]), (box[1], box[3]))
+            if any(low is not None and high is not None and low >= high for low, high in sides):
+                raise BadInput(f"{where}: box {at} is {box}; its upper x and y must be above its lower ones")
+        across, along, _ = self._fields
+        times = torch.zeros(len(across) + 1, len(along) + 1)
+        for part in self._parts():
+            times[part] += 1
+        if not bool((times == 1).all()):
+            found = "in none of the cells" if bool((times < 1).any()) else "in several cells"
+            raise BadInput(f"{where}: some place on the ground is {found}; each must be in exactly one, far away too")
+
     @property
     def count(self) -> int:
         """Blocks."""
@@ -149,15 +178,24 @@ class Cells:
 
         A place is found among the borders of each axis: with as many steps as a cell has there, however many cells.
         """
-        ends = [{end for box in self.boxes for end in (box[axis], box[axis + 2]) if end is not None} for axis in (0, 1)]
-        borders = [sorted(some) for some in ends]
-        rows: list[dict[float | None, int]] = [{end: at + 1 for at, end in enumerate(some)} for some in borders]
-        x, y = rows
-        blocks = torch.full((len(x) + 1, len(y) + 1), -1)
-        for (x0, y0, x1, y1), block in zip(self.boxes, self.blocks, strict=True):
-            blocks[x.get(x0, 0) : x.get(x1), y.get(y0, 0) : y.get(y1)] = block
+        borders = self._borders()
+        blocks = torch.full((len(borders[0]) + 1, len(borders[1]) + 1), -1)
+        for part, block in zip(self._parts(), self.blocks, strict=True):
+            blocks[part] = block
         across, along = (torch.tensor(some, dtype=torch.float64) for some in borders)
         return across, along, blocks
+
+    def _borders(self) -> tuple[list[float], list[float]]:
+        """All borders along each axis, in order."""
+        x, y = ({end for box in self.boxes for end in (box[axis], box[axis + 2]) if end is not None} for axis in (0, 1))
+        return sorted(x), sorted(y)
+
+    def _parts(self) -> Iterator[tuple[slice, slice]]:
+        """The fields between the borders that each box is made of."""
+        rows: list[dict[float | None, int]] = [{end: at + 1 for at, end in enumerate(s)} for s in self._borders()]
+        x, y = rows
+        for x0, y0, x1, y1 in self.boxes:
+            yield slice(x.get(x0, 0), x.get(x1)), slice(y.get(y0, 0), y.get(y1))
 
 
 @dataclass(frozen=True)

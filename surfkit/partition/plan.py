@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, expect_kind, expect_tensor
 from surfkit.core.events import Warned, emit
+from surfkit.core.registry import class_path
 from surfkit.partition.assign import Assign, inside
 from surfkit.partition.base import Cells, CoarseModel, Partition
 
@@ -93,8 +94,11 @@ def plan(
         BadInput: The scene cannot be cut, or no block has a view.
     """
     cells = partition.cells(sight)
+    expect_kind(f"{class_path(type(partition))}.cells", cells, Cells)
+    cells.refuse_untiled(f"{class_path(type(partition))}.cells")
     owner = cells.owner(sight.splats.means)
     joins = assign.joins(sight, cells)
+    expect_tensor(f"{class_path(type(assign))}.joins", joins, ("bool",), (len(sight.views), cells.count))
     if not joins.any():
         raise BadInput("partition: no view shows any block; lower the threshold of the assignment")
     here = inside(sight, cells) & joins

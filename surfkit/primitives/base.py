@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
-from surfkit.core.registry import Component, kebab
+from surfkit.core.check import BadInput, expect_kind, expect_tensor
+from surfkit.core.registry import Component, kebab, name_of
 from surfkit.io.splats.splat_table import SplatTable
 from surfkit.primitives.columns import SIGMOID, Activation, Column
 from surfkit.primitives.draws import normals
@@ -240,6 +240,29 @@ class Primitive(Component):
                 "`split` and `table` of its own"
             )
         return found.activation
+
+
+def refuse_other_params(primitive: Primitive, params: Any, where: str = "its points") -> None:
+    """BadInput unless raw parameters are those that `columns` declares, float32, with as many rows as there are
+    positions.
+
+    Args:
+        primitive: What the points are.
+        params: Raw columns of N points, and the shared ones.
+        where: What gives them, in messages.
+    """
+    expect_kind(where, params, dict)
+    declared = primitive.columns()
+    if set(params) != set(declared):
+        raise BadInput(
+            f"primitive {name_of(primitive)} declares the columns {', '.join(sorted(declared))}, and {where} have "
+            f"{', '.join(sorted(params))}"
+        )
+    sizes = expect_tensor(f"{where}: means", params["means"], ("float32",), ("N", 3))
+    for name, column in declared.items():
+        rows = () if column.shared else ("N",)
+        any_or_known = tuple(f"any {axis}" if size is None else size for axis, size in enumerate(column.shape))
+        expect_tensor(f"{where}: {name}", params[name], ("float32",), (*rows, *any_or_known), sizes)
 
 
 def harmonics(params: Columns, degree: int) -> Tensor:

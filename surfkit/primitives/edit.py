@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, expect_kind, expect_tensor
 from surfkit.core.registry import class_path
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns, Points
@@ -126,7 +126,9 @@ def apply_in_place(
         added.append(copies)
     if edit.split is not None and edit.split.any():
         parents = {name: value[edit.split] for name, value in points.params.items()}
-        added.append(primitive.split(parents | points.shared, generator))
+        children = primitive.split(parents | points.shared, generator)
+        expect_rows(f"{class_path(type(primitive))}.split", children, points.params, 2 * int(edit.split.sum()))
+        added.append(children)
         keep = ~edit.split
     if edit.new is not None and len(edit.new):
         added.append(edit.new.params)
@@ -146,8 +148,18 @@ def apply_in_place(
         _dim(primitive, points, edit.max_opacity)
 
 
-def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
-    """What a policy asks for, or BadInput if it is no edit of so many points: other masks would pass for indices."""
+def sound(edit: Edit | None, count: int, policy: object, columns: Columns) -> Edit | None:
+    """What a policy asks for, or BadInput if it is no edit of so many points: other masks would pass for indices, and
+    what cannot be drawn would be found out in a later step, which could not tell whose it was.
+
+    Moves are not looked at, as some policies move all points in every step, and a GPU would be waited for.
+
+    Args:
+        edit: What it gives.
+        count: N points.
+        policy: Named in messages.
+        columns: Of points, whose types and shapes new ones must have.
+    """
     if edit is None:
         return None
     name = f"{class_path(type(policy))}.edit"
@@ -161,7 +173,53 @@ def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
             came = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             kind = " or ".join(str(each).removeprefix("torch.") for each in kinds)
             raise BadInput(f"{name}: {field} is {came}; it must be {kind} of shape {wanted}, a value for each point")
+    _refuse_out_of_range(name, edit)
+    if edit.new is not None:
+        expect_kind(f"{name}: new", edit.new, NewPoints)
+        expect_tensor(f"{name}: new.parent", edit.new.parent, ("int64",), ("M",))
+        if len(edit.new) and not 0 <= int(edit.new.parent.min()) <= int(edit.new.parent.max()) < count:
+            raise BadInput(
+                f"{name}: new.parent names points that are not there; they are counted from 0 to {count - 1}"
+            )
+        expect_rows(f"{name}: new", edit.new.params, columns, len(edit.new))
     return edit
+
+
+def _refuse_out_of_range(name: str, edit: Edit) -> None:
+    """BadInput for values that no point can have; of points that are dropped anyway none is looked at."""
+    most = edit.max_opacity
+    if most is not None and not (isinstance(most, (int, float)) and 0 < most < 1):
+        raise BadInput(f"{name}: max_opacity is {str(most)[:40]}; it must be a number between 0 and 1")
+    left = None if edit.drop is None else ~edit.drop
+    checks: tuple[tuple[str, str, Callable[[Tensor], Tensor]], ...] = (
+        ("clone", "0 or more", lambda value: value >= 0),
+        ("opacities", "between 0 and 1, or NaN", lambda value: value.isnan() | ((value > 0) & (value < 1))),
+        ("scale_by", "finite and above 0", lambda value: (value > 0) & value.isfinite()),
+    )
+    for field, wanted, fits in checks:
+        value = getattr(edit, field)
+        if value is None or value.dtype == torch.bool:
+            continue
+        wrong = ~fits(value) if left is None else ~fits(value) & left
+        if wrong.any():
+            raise BadInput(f"{name}: {field} of point {int(wrong.nonzero()[0])} is {value[wrong][0]:g}; give {wanted}")
+
+
+def expect_rows(where: str, given: Any, columns: Columns, count: int) -> None:
+    """BadInput unless there are so many rows of each column: those of another number or width would be cut or repeated.
+
+    Args:
+        where: Begins messages.
+        given: Raw parameters by name; the shared ones may be among them.
+        columns: Of the points that are there, (N, ...) each.
+        count: Rows.
+    """
+    expect_kind(where, given, dict)
+    for name, column in columns.items():
+        if name not in given:
+            raise BadInput(f"{where}: there is no column {name}; the points have {', '.join(sorted(columns))}")
+        kind = str(column.dtype).removeprefix("torch.")
+        expect_tensor(f"{where}: {name}", given[name], (kind,), (count, *column.shape[1:]))
 
 
 def withheld(edit: Edit, may: Tensor) -> Edit:
@@ -302,6 +360,9 @@ def _give(points: Points, values: Columns) -> None:
         if name not in known or value.shape != known[name].shape:
             shape = tuple(known[name].shape) if name in known else "no such parameter"
             raise BadInput(f"Edit.values: {name!r} has shape {tuple(value.shape)}, and the points have {shape}")
+        expect_tensor(
+            f"Edit.values: {name!r}", value, (str(known[name].dtype).removeprefix("torch."),), tuple(value.shape)
+        )
     points.shared.update({name: value for name, value in values.items() if name in points.shared})
     _put(points, {name: value for name, value in values.items() if name not in points.shared})
 

@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.compress.base import Compressor
+from surfkit.compress.base import Compressor, Plan
 from surfkit.compress.container import ModelFile, write_model
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault, expect, expect_kind, read_only
 from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
-from surfkit.core.registry import name_of
+from surfkit.core.registry import class_path, name_of
 from surfkit.densify.trim import Trim
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
@@ -137,7 +137,12 @@ def writing(
     """
 
     def write(path: Path, compressor: Compressor) -> int:
-        plan = compressor.plan(model, importance, seed, device)
+        name = f"{class_path(type(compressor))}.plan"
+        with read_only(name, model.params, Fault):
+            plan = compressor.plan(model, importance, seed, device)
+        expect_kind(name, plan, Plan)
+        for mark, value in plan.marks.items():
+            expect(f"{name}: marks: {mark}", value, (len(model), *tuple(getattr(value, "shape", ()))[1:]))
         return write_model(
             path, model, plan, compressor, frame, lambda done, of: emit(Progress("compressing points", done, of))
         )

@@ -293,6 +293,7 @@ def export(run: Run, splats: SplatModel, scene: Scene) -> None:
         emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(splats.primitive)}"))
         return
     table = splats.primitive.table(splats.params).in_input_frame(scene.frame)
+    table.refuse_unsound(run.cloud)
     write_splats(run.cloud, table, frame=scene.frame)
     emit(FileWritten(run.cloud, "points"))
 

@@ -19,6 +19,7 @@ from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
 from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.io.datasets.fingerprint import Fingerprint, digest, fingerprint
 from surfkit.mesh.base import Mesher, MeshInput
+from surfkit.primitives.base import refuse_other_params
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.base import Rasterizer
 from surfkit.runs.context import RunContext
@@ -81,6 +82,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
             return mesh_input(run, found, scene, ctx.rasterizer, cache_bytes("auto"), mesher)
 
         params = refine.begin(found.splats, to_mesh)
+        refuse_other_params(stage.primitive, params, f"{stage.setting}: the points that it begins with")
         return InitialModel({name: value.clone() for name, value in params.items()}, given.sh_degree)
 
     intervals = replace(ctx.intervals, pictures=0)
@@ -135,7 +137,12 @@ def _own_maps(
 
 def stage_scene(run: Run, stage: RunStage, scene: Scene) -> Scene:
     """The scene with the training views of a stage."""
-    return scene if stage.refine is None else replace(scene, train=stage.refine.views(scene.train, run.recipe.seed))
+    if stage.refine is None:
+        return scene
+    views = tuple(stage.refine.views(scene.train, run.recipe.seed))
+    if not views:
+        raise BadInput(f"{stage.setting.rpartition('.')[0]}: views: there are none to look from")
+    return replace(scene, train=views)
 
 
 def _rendered_data(before: RunStage, given: StageState, scene: Scene, rasterizer: Rasterizer) -> TrainingData:

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, expect, expect_kind
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory, peak_memory_bytes
 from surfkit.evaluate.images.measure_images import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
+from surfkit.primitives.base import refuse_other_params
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Points
 from surfkit.primitives.storage import Storage
@@ -178,7 +179,11 @@ def begin(job: StageJob, trainer: Trainer) -> StageState:
     generator = torch.Generator().manual_seed(job.run.recipe.seed)
     began = time.perf_counter(), time.process_time()
     start, primitive = job.start(generator), job.stage.primitive
+    expect_kind("start.model", start, InitialModel)
+    refuse_other_params(primitive, start.params, "the points that it begins with")
     points = Points.fresh(start.params, primitive.shared(), trainer.home)
+    for name, value in start.stats.items():
+        expect(f"the points that it begins with: stats: {name}", value, (len(points), *tuple(value.shape)[1:]))
     points.stats.update({name: points.storage.held(value) for name, value in start.stats.items()})
     model = job.stage.stage.appearance
     light = light_of(job.run, job.scene.train) if model is not None and model.needs_light else None

@@ -6,11 +6,13 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from surfkit.core.registry import Component
+from surfkit.core.check import BadInput, expect_kind, expect_tensor
+from surfkit.core.registry import Component, class_path
 from surfkit.io.datasets.depth_prior import DepthPrior
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
@@ -49,6 +51,22 @@ class InitialModel:
     params: Columns
     sh_degree: int = 0
     stats: Columns = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.sh_degree not in range(4):
+            raise BadInput(f"the points begin with sh_degree {self.sh_degree}; it must be 0, 1, 2 or 3")
+
+
+def _refuse_unsound(where: str, cloud: Any) -> None:
+    """BadInput unless it is points with colours; those in [0, 1] would begin as black, and be learnt slowly."""
+    expect_kind(where, cloud, SparsePoints)
+    sizes = expect_tensor(f"{where}: xyz", cloud.xyz, ("float32", "float64"), ("P", 3))
+    expect_tensor(f"{where}: rgb", cloud.rgb, ("uint8",), ("P", 3), sizes)
+    for name, shape in (("normals", ("P", 3)), ("opacity", ("P",)), ("size", ("P",))):
+        if (value := getattr(cloud, name)) is not None:
+            expect_tensor(f"{where}: {name}", value, ("float32", "float64"), shape, sizes)
+    if not bool(cloud.xyz.isfinite().all()):
+        raise BadInput(f"{where}: xyz: {int((~cloud.xyz.isfinite()).any(1).sum())} of {len(cloud.xyz)} are not finite")
 
 
 class Start(Component):
@@ -100,7 +118,9 @@ class Start(Component):
         Raises:
             BadInput: There is nothing to start from.
         """
-        return InitialModel(primitive.init(self.cloud(known), generator))
+        cloud = self.cloud(known)
+        _refuse_unsound(f"{class_path(type(self))}.cloud", cloud)
+        return InitialModel(primitive.init(cloud, generator))
 
     @abstractmethod
     def cloud(self, known: StartInput) -> SparsePoints:

@@ -134,7 +134,7 @@ def wanted_of_all(processes: Processes, policies: Sequence[Policy], points: Poin
         EveryPoint({}, {}, {}, own=points, processes=processes, counts=counts),
         of_all(processes, counts, step),
     )
-    return merge([sound(policy.edit(every, whole), len(every), policy) for policy in policies])
+    return merge([sound(policy.edit(every, whole), len(every), policy, points.params) for policy in policies])
 
 
 def of_all(processes: Processes, counts: Sequence[int], step: Step) -> Step:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput, expect
+from surfkit.core.check import BadInput, expect, read_only
 from surfkit.densify.base import Signal
 from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.primitives.points import Columns
@@ -82,10 +82,13 @@ def loss_gradients(
     changed = plain = ignoring(shown, target)
     if appearance is not None and appearance.model.spares_structure:
         plain = ignoring(leafy, target)  # hidden pixels of the photograph are then those of the scene as it is
-    values = {
-        name: weight * _one_number(name, losses[name](*(plain if losses[name].of_structure else changed)))
-        for name, weight in active.items()
-    }
+
+    def value_of(name: str) -> Tensor:
+        given = plain if losses[name].of_structure else changed
+        with read_only(f"losses.{name}", {"target.photo": given[1].photo}):
+            return _one_number(name, losses[name](*given))
+
+    values = {name: weight * value_of(name) for name, weight in active.items()}
     numbers = as_numbers(values)
     if terms is None:
         total = gradient(list(values.values()), leaves, appearance)

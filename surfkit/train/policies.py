@@ -8,12 +8,13 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput, expect
+from surfkit.core.check import BadInput, expect, read_only
 from surfkit.core.registry import class_path
-from surfkit.densify.base import ComparedView, Signal, Step, ViewStatistics
+from surfkit.densify.base import ComparedView, Policy, Signal, Step, ViewStatistics
 from surfkit.losses.base import ignoring
 from surfkit.primitives.edit import Edit, merge, sound, withheld
 from surfkit.primitives.init import SH_C0
+from surfkit.primitives.points import Points
 from surfkit.raster.api import Gradients, Maps, Splats
 from surfkit.scene.camera import Camera
 from surfkit.train.divide import own_rows, wanted_of_all
@@ -136,9 +137,17 @@ def wanted(setup: StageSetup, state: StageState, step: Step) -> Edit | None:
     if setup.processes is not None:
         return wanted_of_all(setup.processes, policies, points, step)
     for policy in policies:
-        policy.watch(points, step)
-    edit = merge([sound(policy.edit(points, step), len(points), policy) for policy in policies])
+        with read_only(f"{class_path(type(policy))}.watch", points.params):
+            policy.watch(points, step)
+    edit = merge([_asked(policy, points, step) for policy in policies])
     return edit if edit is None or step.owns is None else withheld(edit, step.may_be_densified())
+
+
+def _asked(policy: Policy, points: Points, step: Step) -> Edit | None:
+    """What one policy asks for."""
+    with read_only(f"{class_path(type(policy))}.edit", points.params):
+        edit = policy.edit(points, step)
+    return sound(edit, len(points), policy, points.params)
 
 
 def lengths(vectors: Tensor) -> Tensor:

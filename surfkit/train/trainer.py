@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from surfkit.appearance.base import PhotoLight
-from surfkit.core.check import BadInput
 from surfkit.core.events import StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
-from surfkit.core.registry import name_of
 from surfkit.losses.base import Target
+from surfkit.primitives.base import refuse_other_params
 from surfkit.primitives.edit import OBSERVED_EVERY, observe
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Maps
@@ -74,12 +73,7 @@ class Trainer(StageSetup):
             frozen: As in `StageState`.
             light: That of the photographs, where the appearance needs it; None changes no colour.
         """
-        declared = set(self.primitive.columns())
-        if set(points.all_params()) != declared:
-            raise BadInput(
-                f"primitive {name_of(self.primitive)} declares the columns {', '.join(sorted(declared))}, and its "
-                f"points have {', '.join(sorted(points.all_params()))}"
-            )
+        refuse_other_params(self.primitive, points.all_params())
         points = points.with_moments(self.stage.optimizer.moment_type())
         state = StageState(points, ViewOrder(len(self.views)), generator, frozen=frozen or {})
         if (model := self.stage.appearance) is not None:

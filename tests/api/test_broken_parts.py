@@ -22,6 +22,8 @@ class BrokenLoss(Loss):
         return None if self.how == "weight" else 0.1
 
     def __call__(self, maps, target):
+        if self.how == "photo":
+            target.photo.mul_(0.5)
         error = (maps.need("color") - target.photo).abs()
         given = {"float": 0.5, "image": error, "none": None, "detached": error.mean().detach(), "zero": torch.zeros(())}
         return given.get(self.how, error.mean())
@@ -98,6 +100,7 @@ def scene(tmp_path_factory):
         ("pretrain.losses.mine", BrokenLoss("none"), r"losses.mine: expected shape \(\), got NoneType"),
         ("pretrain.losses.mine", BrokenLoss("image"), r"losses.mine: expected shape \(\), got \(3, 36, 48\)"),
         ("pretrain.losses.mine", BrokenLoss("detached"), r"losses.mine: its value 0\.\d+ does not depend on what is"),
+        ("pretrain.losses.mine", BrokenLoss("photo"), r"losses.mine changes target.photo in place"),
         ("pretrain.losses.mine", BrokenLoss("weight"), "losses.mine: its weight in step 1 is None"),
         ("pretrain.signal", BrokenSignal(), r"BrokenSignal.combine: expected shape \(\d+, 2\), got \(5, 2\)"),
         ("pretrain.signal", BrokenSignal("nan"), "BrokenSignal.combine: NaN or Inf, of gradients that are finite"),
