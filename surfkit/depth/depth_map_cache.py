@@ -14,7 +14,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput, Fault, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
-from surfkit.core.files import DISK_FULL, sweep
+from surfkit.core.files import DISK_FULL, refuse_unwritable, sweep
 from surfkit.core.lock import IN_USE_FILE, is_used, lock_holder, locked, mark_used
 from surfkit.depth.prepare_depth_maps import DepthPreparation, fault_of, files_of, without_damaged
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, is_whole, map_path, read_record, write_record
@@ -120,12 +120,26 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
             except FileNotFoundError:  # it was deleted just now, to make room
                 pass
             except OSError as error:
-                raise BadInput(
-                    f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, "
-                    f"make them with `surfkit prepare depth {shlex.quote(str(data))}`, or do without: --no-prepare"
-                ) from error
+                raise unwritable(folder, data, error) from error
             time.sleep(PROCESS_POLL_S)
         yield
+
+
+def refuse_unwritable_cache(data: Path) -> None:
+    """BadInput if the cache takes no maps: asked before what they are made from is computed; `data`: their data set."""
+    root = folder_of("any").parent
+    try:
+        refuse_unwritable(root)
+    except OSError as error:
+        raise unwritable(root, data, error) from error
+
+
+def unwritable(folder: Path, data: Path, error: OSError) -> BadInput:
+    """That a folder of the cache cannot be written to, and what to do."""
+    return BadInput(
+        f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, make them with "
+        f"`surfkit prepare depth {shlex.quote(str(data))}`, or do without: --no-prepare"
+    )
 
 
 def make_missing(preparation: DepthPreparation, scene: Scene, tracks: Observations) -> tuple[bool, DepthMapIndex]:

@@ -16,8 +16,11 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
+from surfkit.depth.depth_map_cache import refuse_unwritable_cache
+from surfkit.depth.prepare_depth_maps import DepthPreparation
 from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.io.datasets.fingerprint import Fingerprint, digest, fingerprint
+from surfkit.io.datasets.read import observations
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.base import Rasterizer
@@ -42,6 +45,7 @@ from surfkit.train.data_cache import TrainingData, read_ahead
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.refine.base import Refine
 from surfkit.train.state import StageState
+from surfkit.train.streaming import open_last
 
 DRAWN_AHEAD = 2
 """Rendered pictures that are cached: each is needed once."""
@@ -59,6 +63,33 @@ def refine_model(ctx: RunContext, state: StageState) -> StageState:
             state = _refine_once(ctx, before, state, stage, stage.refine)
             ctx.keep(stage.name)
     return state
+
+
+def refuse_unrefinable(ctx: RunContext) -> None:
+    """BadInput, before hours are spent on the stages before, if a refinement cannot make the depth maps that it needs.
+
+    Those that are finished, or that another run has made, need none.
+    """
+    run, shared, done = ctx.run, {} if ctx.shares is None else ctx.shares.found, True
+    if not any(refine.estimator for refine in run.recipe.refine):
+        return
+    for stage in run.stages:
+        begun, estimator = open_last(stage.checkpoint), None if stage.refine is None else stage.refine.estimator
+        done = done and begun is not None and begun[0].state.index >= stage.stage.steps  # with those before
+        if done or estimator is None or stage.name in shared:
+            continue
+        what = stage.setting.rpartition(".")[0]
+        if ctx.caches.maps is None:
+            raise BadInput(f"--no-prepare: {what} makes depth maps of what the model draws; leave out one of the two")
+        try:
+            estimator.refuse_missing()
+            estimator.files(ctx.scene.train)  # which are looked for
+            maps = DepthPreparation(run.data, estimator, ctx.rasterizer.where())
+            maps.refuse_unfit(ctx.scene, observations(run.data, ctx.scene))
+        except BadInput as error:
+            raise BadInput(f"{what} cannot make its depth maps: {error}") from error
+        if begun is None:  # a cache that can only be read may have those of a stage that is begun
+            refuse_unwritable_cache(run.data.path)
 
 
 def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage, refine: Refine) -> StageState:
@@ -110,11 +141,9 @@ def _own_maps(
     """Within, there are depth maps that an estimator makes from what the model of the stage before draws: their folder.
 
     Raises:
-        BadInput: They may not be made, or cannot.
+        BadInput: They cannot be made.
     """
     run, scene = replace(ctx.run, data=replace(ctx.run.data, priors=None)), ctx.scene
-    if ctx.caches.maps is None:
-        raise BadInput(f"{stage.setting.rpartition('.')[0]}: it makes depth maps; leave out --no-prepare")
     draw = lru_cache(1)(lambda: drawing(before, given, ctx.rasterizer))
 
     def see(at: int, camera: Camera) -> KnownSurface:

@@ -10,6 +10,7 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.core.tree import evolve
 from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.depth.fill_monocular import MonocularFill
 from surfkit.depth.filled import Filled
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -128,9 +129,40 @@ def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_pa
     assert [read_made(folder).maps for folder in (own_cache / "depth").iterdir()] == [7, 7]
 
 
-def test_maps_may_not_be_made(farm, recipe, tmp_path):
-    with pytest.raises(BadInput, match=r"refine\.0: it makes depth maps; leave out --no-prepare"):
-        run(recipe, farm, tmp_path, Compute("cpu"), EVERY, CacheSettings(maps=None))
+@pytest.mark.parametrize(
+    ("refine", "caches", "told"),
+    [
+        (REFINED, CacheSettings(maps=None), r"--no-prepare: refine\.0 makes depth maps"),
+        (
+            replace(REFINED, depth=replace(QUICK, window=17, scale=4)),
+            None,
+            r"refine\.0 cannot make its depth maps: .*window",
+        ),
+        (
+            replace(REFINED, depth=Filled(stereo=QUICK, fill=MonocularFill(maps="/nowhere"))),
+            None,
+            r"refine\.0 cannot make its depth maps: fill\.maps is /nowhere",
+        ),
+        (REFINED, None, r"cannot be written .*SURFKIT_CACHE"),
+    ],
+)
+def test_maps_that_cannot_be_made_are_told_before_anything_is_trained(
+    farm, recipe, tmp_path, own_cache, monkeypatch, refine, caches, told
+):
+    if "SURFKIT_CACHE" in told:
+        (tmp_path / "file").write_text("no folder")
+        monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "file"))
+    with pytest.raises(BadInput, match=told):
+        run(replace(recipe, refine=(refine,)), farm, tmp_path / "out", Compute("cpu"), EVERY, caches)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_refined_run_needs_no_maps_any_more_until_it_is_made_longer(farm, recipe, tmp_path, own_cache):
+    none = CacheSettings(maps=None)
+    run(recipe, farm, tmp_path, Compute("cpu"), EVERY)
+    run(recipe, farm, tmp_path, Compute("cpu"), EVERY, none)
+    with pytest.raises(BadInput, match="--no-prepare"):
+        run(evolve(recipe, "pretrain.steps", 8), farm, tmp_path, Compute("cpu"), EVERY, none)
 
 
 @pytest.mark.parametrize("wrong", [{"depth": PlaneSweep()}, {"depth": DepthAnythingV2()}, {"stage": Stage()}])
