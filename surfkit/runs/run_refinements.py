@@ -89,7 +89,7 @@ def refuse_unrefinable(ctx: RunContext) -> None:
         except BadInput as error:
             raise BadInput(f"{what} cannot make its depth maps: {error}") from error
         if begun is None:  # a cache that can only be read may have those of a stage that is begun
-            refuse_unwritable_cache(run.data.path)
+            refuse_unwritable_cache(what)
 
 
 def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage, refine: Refine) -> StageState:

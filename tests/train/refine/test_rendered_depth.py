@@ -143,7 +143,7 @@ def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_pa
             None,
             r"refine\.0 cannot make its depth maps: fill\.maps is /nowhere",
         ),
-        (REFINED, None, r"cannot be written .*SURFKIT_CACHE"),
+        (REFINED, None, r"cannot be written .*SURFKIT_CACHE to a folder for depth maps, or leave refine\.0 out"),
     ],
 )
 def test_maps_that_cannot_be_made_are_told_before_anything_is_trained(
