@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, read_json
 from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
 from surfkit.depth.depth_map_cache import refuse_unwritable_cache
 from surfkit.depth.prepare_depth_maps import DepthPreparation
@@ -32,6 +32,7 @@ from surfkit.runs.make_mesh import mesh_input
 from surfkit.runs.measure_run import measure_before
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.photo_light import held_out_response
+from surfkit.runs.run_cache import versions
 from surfkit.runs.run_method import with_drawing
 from surfkit.runs.run_notes import prefix_notes
 from surfkit.runs.run_stage import StageJob, drawing, load_state, optimise
@@ -152,8 +153,9 @@ def _own_maps(
         return KnownSurface(torch.where(depth > 0, 1 / depth.clamp_min(1e-12), 0), normal)
 
     model = before.stage.finished(given)
+    drawn_by = dump(before.primitive), before.stage.near, versions(run.recipe)  # depth is not of the points alone
     prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)
-    known = KnownSurfaces(see, digest([model[name] for name in sorted(model)]))
+    known = KnownSurfaces(see, digest([str(drawn_by), *(model[name] for name in sorted(model))]))
     device = ctx.rasterizer.where().type
     with made_maps(run, estimator, scene, prints, ctx.caches, device, known) as folder:
         if folder is None:

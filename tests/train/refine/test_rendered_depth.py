@@ -17,7 +17,9 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.losses.depth import DepthRegression
+from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.raster.select import select
+from surfkit.runs import run_refinements
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import load_run, run
@@ -127,6 +129,25 @@ def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_pa
     twice = replace(recipe, refine=(REFINED, replace(REFINED, depth=Filled(stereo=QUICK))))
     run(twice, farm, tmp_path, Compute("cpu"), EVERY)
     assert [read_made(folder).maps for folder in (own_cache / "depth").iterdir()] == [7, 7]
+
+
+def test_other_depth_of_the_same_points_gives_other_maps(farm, recipe, tmp_path, own_cache, monkeypatch):
+    """Points that were trained to the same bits, without a loss on depth, but drawn otherwise, or by other code."""
+    recipe, made = replace(recipe, primitive=Gaussian3D(sh_degree=0)), []
+    for name, geometry, version in (
+        ("axis", "axis", "1"),
+        ("plane", "plane", "1"),
+        ("new", "plane", "2"),
+        ("again", "plane", "2"),
+    ):
+        monkeypatch.setattr(run_refinements, "versions", lambda _, version=version: {"surfkit": version})
+        run(evolve(recipe, "primitive.geometry", geometry), farm, tmp_path / name, Compute("cpu"), EVERY)
+        made.append(len(list((own_cache / "depth").iterdir())))
+    points = [
+        checkpoint.load_last(tmp_path / name / "pretrain" / "checkpoint.safetensors")[0] for name in ("axis", "plane")
+    ]
+    torch.testing.assert_close(*(state.points.params for state in points), rtol=0, atol=0)
+    assert made == [1, 2, 3, 3]
 
 
 @pytest.mark.parametrize(
