@@ -15,6 +15,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json
+from surfkit.core.events import Warned, emit
 from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
 from surfkit.depth.depth_map_cache import refuse_unwritable_cache
 from surfkit.depth.prepare_depth_maps import DepthPreparation
@@ -24,8 +25,9 @@ from surfkit.io.datasets.read import observations
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.base import Rasterizer
+from surfkit.runs import journal
 from surfkit.runs.context import RunContext
-from surfkit.runs.ensure_depth_maps import made_maps, with_priors
+from surfkit.runs.ensure_depth_maps import OTHER_MAPS, made_maps, with_priors
 from surfkit.runs.folder import Run, RunStage, discard_results
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_mesh import mesh_input
@@ -117,6 +119,9 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     intervals = replace(ctx.intervals, pictures=0)
     stage.folder.mkdir(exist_ok=True)
+    noted = [
+        str(line.get("text")) for line in journal.read(stage.folder / journal.JOURNAL_FILE) if line["event"] == "Warned"
+    ]
     with ExitStack() as use:
         use.enter_context(record_events(stage.folder))
         use.enter_context(prefix_notes(f"{stage.title}: "))  # steps are counted from 1 again
@@ -126,6 +131,8 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
         own, began = run, time.perf_counter()
         if refine.estimator is not None:
             folder = use.enter_context(_own_maps(ctx, before, given, stage, refine.estimator))
+            if state is not None and not any(folder.name in text for text in noted):
+                emit(Warned(OTHER_MAPS))
             own, spent = with_priors(run, folder), read_made(folder).cpu_seconds  # also where they were made before
             seconds = given.seconds + time.perf_counter() - began
             given = replace(given, seconds=seconds, cpu_seconds=given.cpu_seconds + spent)

@@ -125,6 +125,25 @@ def test_interrupted_in_every_part_and_gone_on_with(farm, recipe, tmp_path, own_
     assert (tmp_path / "out/point_cloud.ply").read_bytes() == (tmp_path / "whole/point_cloud.ply").read_bytes()
 
 
+def test_a_stage_that_goes_on_with_other_maps_says_so(farm, recipe, tmp_path, own_cache, monkeypatch):
+    save, text = checkpoint.save, "refine0: what depth maps are made from, or how, has changed"
+
+    def stop(path, state):
+        save(path, state)
+        if path.parent.name == "refine0":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint, "save", stop)
+    for _ in range(2):  # after 2 of 5 steps, and after 4
+        with pytest.raises(KeyboardInterrupt):
+            run(evolve(recipe, "refine.0.stage.steps", 5), farm, tmp_path, Compute("cpu"), EVERY)
+        assert text not in (tmp_path / "run.json").read_text()
+    monkeypatch.setattr(checkpoint, "save", save)
+    monkeypatch.setattr(PatchMatch, "version", 1000)
+    run(evolve(recipe, "refine.0.stage.steps", 5), farm, tmp_path, Compute("cpu"), EVERY)
+    assert text in (tmp_path / "run.json").read_text()
+
+
 def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_path, own_cache):
     twice = replace(recipe, refine=(REFINED, replace(REFINED, depth=Filled(stereo=QUICK))))
     run(twice, farm, tmp_path, Compute("cpu"), EVERY)
