@@ -14,7 +14,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput, Fault, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
-from surfkit.core.files import DISK_FULL, sweep
+from surfkit.core.files import DISK_FULL, refuse_unwritable, sweep
 from surfkit.core.lock import IN_USE_FILE, is_used, lock_holder, locked, mark_used
 from surfkit.depth.prepare_depth_maps import DepthPreparation, fault_of, files_of, without_damaged
 from surfkit.io.datasets.depth_files import DEPTH_FOLDER, DEPTH_RECORD, is_whole, map_path, read_record, write_record
@@ -77,8 +77,13 @@ def maps(
     if folder.is_dir() and not os.access(folder, os.W_OK) and is_complete(preparation, scene):
         yield folder, read_made(folder)
         return
+    make = (
+        f"make them with `surfkit prepare depth {shlex.quote(str(preparation.data.path))}`, or do without: --no-prepare"
+    )
+    # Those that begin at what a model draws are made in no other way.
+    otherwise = make if preparation.known is None else "or leave out what makes them of the model"
     with ExitStack() as use:
-        with hold_folder(folder, preparation.data.path):
+        with hold_folder(folder, otherwise):
             sweep(folder)
             forget_incomplete(folder, scene)
             use.enter_context(mark_used(folder))
@@ -105,8 +110,8 @@ def full_cache_in_one_line(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def hold_folder(folder: Path, data: Path) -> Iterator[None]:
-    """Within, no other process writes into a folder of the cache; waits for one that does."""
+def hold_folder(folder: Path, otherwise: str) -> Iterator[None]:
+    """Within, no other process writes into a folder of the cache; waits for one that does. See `unwritable`."""
     with ExitStack() as inside:
         told = False
         while True:
@@ -120,12 +125,25 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
             except FileNotFoundError:  # it was deleted just now, to make room
                 pass
             except OSError as error:
-                raise BadInput(
-                    f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, "
-                    f"make them with `surfkit prepare depth {shlex.quote(str(data))}`, or do without: --no-prepare"
-                ) from error
+                raise unwritable(folder, otherwise, error) from error
             time.sleep(PROCESS_POLL_S)
         yield
+
+
+def refuse_unwritable_cache(what: str) -> None:
+    """BadInput if the cache takes no maps: asked before what they are made from is computed; `what` makes them."""
+    root = folder_of("any").parent
+    try:
+        refuse_unwritable(root)
+    except OSError as error:
+        raise unwritable(root, f"or leave {what} out", error) from error
+
+
+def unwritable(folder: Path, otherwise: str, error: OSError) -> BadInput:
+    """That a folder of the cache cannot be written to, and what to do, or `otherwise`."""
+    return BadInput(
+        f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, {otherwise}"
+    )
 
 
 def make_missing(preparation: DepthPreparation, scene: Scene, tracks: Observations) -> tuple[bool, DepthMapIndex]:

@@ -29,6 +29,9 @@ from surfkit.scene.scene import Scene
 from surfkit.train.data_cache import CacheSettings
 from surfkit.train.streaming import open_last
 
+OTHER_MAPS = "what depth maps are made from, or how, has changed: the steps to come look at other maps"
+"""Of a run, or a stage of it, that goes on."""
+
 
 @contextmanager
 def with_maps(
@@ -69,7 +72,7 @@ def with_maps(
         with ExitStack() as use:
             folder = use.enter_context(made_maps(run, run.recipe.depth, scene, prints, caches, device))
             if begun and folder is not None and before is not None and folder.name != before.name:
-                emit(Warned("what depth maps are made from, or how, has changed: the steps to come look at other maps"))
+                emit(Warned(OTHER_MAPS))
             yield run if folder is None else with_priors(run, folder)
 
 

@@ -57,7 +57,7 @@ from surfkit.runs.run_method import (
     with_drawing,
 )
 from surfkit.runs.run_notes import collect_notes, prefix_notes
-from surfkit.runs.run_refinements import refine_model, stage_scene
+from surfkit.runs.run_refinements import refine_model, refuse_unrefinable, stage_scene
 from surfkit.runs.run_stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.runs.stage_cache import StageCache
 from surfkit.runs.start import InitialPointBuilder, align_priors
@@ -126,6 +126,7 @@ def run(
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
         shares = RunCache.of(run, store, backend, prints)
         ctx = RunContext(run, scene, rasterizer, intervals, caches, shares)
+        refuse_unrefinable(ctx)
         stages = RecipeStages(ctx, compute, meter, state)
         given = use.enter_context(method_input(ctx, compute.device, stages))
         recipe.method.refuse_unfit(given)

@@ -14,22 +14,28 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, read_json
+from surfkit.core.events import Warned, emit
 from surfkit.depth.base import DepthEstimator, KnownSurface, KnownSurfaces
+from surfkit.depth.depth_map_cache import refuse_unwritable_cache
+from surfkit.depth.prepare_depth_maps import DepthPreparation
 from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.io.datasets.fingerprint import Fingerprint, digest, fingerprint
+from surfkit.io.datasets.read import observations
 from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.base import refuse_other_params
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.base import Rasterizer
+from surfkit.runs import journal
 from surfkit.runs.context import RunContext
-from surfkit.runs.ensure_depth_maps import made_maps, with_priors
+from surfkit.runs.ensure_depth_maps import OTHER_MAPS, made_maps, with_priors
 from surfkit.runs.folder import Run, RunStage, discard_results
 from surfkit.runs.journal import record_events
 from surfkit.runs.make_mesh import mesh_input
 from surfkit.runs.measure_run import measure_before
 from surfkit.runs.methods.base import Reconstruction
 from surfkit.runs.photo_light import held_out_response
+from surfkit.runs.run_cache import versions
 from surfkit.runs.run_method import with_drawing
 from surfkit.runs.run_notes import prefix_notes
 from surfkit.runs.run_stage import StageJob, drawing, load_state, optimise
@@ -43,6 +49,7 @@ from surfkit.train.data_cache import TrainingData, read_ahead
 from surfkit.train.memory_meter import MemoryMeter
 from surfkit.train.refine.base import Refine
 from surfkit.train.state import StageState
+from surfkit.train.streaming import open_last
 
 DRAWN_AHEAD = 2
 """Rendered pictures that are cached: each is needed once."""
@@ -60,6 +67,33 @@ def refine_model(ctx: RunContext, state: StageState) -> StageState:
             state = _refine_once(ctx, before, state, stage, stage.refine)
             ctx.keep(stage.name)
     return state
+
+
+def refuse_unrefinable(ctx: RunContext) -> None:
+    """BadInput, before hours are spent on the stages before, if a refinement cannot make the depth maps that it needs.
+
+    Those that are finished, or that another run has made, need none.
+    """
+    run, shared, done = ctx.run, {} if ctx.shares is None else ctx.shares.found, True
+    if not any(refine.estimator for refine in run.recipe.refine):
+        return
+    for stage in run.stages:
+        begun, estimator = open_last(stage.checkpoint), None if stage.refine is None else stage.refine.estimator
+        done = done and begun is not None and begun[0].state.index >= stage.stage.steps  # with those before
+        if done or estimator is None or stage.name in shared:
+            continue
+        what = stage.setting.rpartition(".")[0]
+        if ctx.caches.maps is None:
+            raise BadInput(f"--no-prepare: {what} makes depth maps of what the model draws; leave out one of the two")
+        try:
+            estimator.refuse_missing()
+            estimator.files(ctx.scene.train)  # which are looked for
+            maps = DepthPreparation(run.data, estimator, ctx.rasterizer.where())
+            maps.refuse_unfit(ctx.scene, observations(run.data, ctx.scene))
+        except BadInput as error:
+            raise BadInput(f"{what} cannot make its depth maps: {error}") from error
+        if begun is None:  # a cache that can only be read may have those of a stage that is begun
+            refuse_unwritable_cache(what)
 
 
 def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage, refine: Refine) -> StageState:
@@ -87,6 +121,9 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
 
     intervals = replace(ctx.intervals, pictures=0)
     stage.folder.mkdir(exist_ok=True)
+    noted = [
+        str(line.get("text")) for line in journal.read(stage.folder / journal.JOURNAL_FILE) if line["event"] == "Warned"
+    ]
     with ExitStack() as use:
         use.enter_context(record_events(stage.folder))
         use.enter_context(prefix_notes(f"{stage.title}: "))  # steps are counted from 1 again
@@ -96,6 +133,8 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
         own, began = run, time.perf_counter()
         if refine.estimator is not None:
             folder = use.enter_context(_own_maps(ctx, before, given, stage, refine.estimator))
+            if state is not None and not any(folder.name in text for text in noted):
+                emit(Warned(OTHER_MAPS))
             own, spent = with_priors(run, folder), read_made(folder).cpu_seconds  # also where they were made before
             seconds = given.seconds + time.perf_counter() - began
             given = replace(given, seconds=seconds, cpu_seconds=given.cpu_seconds + spent)
@@ -112,11 +151,9 @@ def _own_maps(
     """Within, there are depth maps that an estimator makes from what the model of the stage before draws: their folder.
 
     Raises:
-        BadInput: They may not be made, or cannot.
+        BadInput: They cannot be made.
     """
     run, scene = replace(ctx.run, data=replace(ctx.run.data, priors=None)), ctx.scene
-    if ctx.caches.maps is None:
-        raise BadInput(f"{stage.setting.rpartition('.')[0]}: it makes depth maps; leave out --no-prepare")
     draw = lru_cache(1)(lambda: drawing(before, given, ctx.rasterizer))
 
     def see(at: int, camera: Camera) -> KnownSurface:
@@ -125,8 +162,9 @@ def _own_maps(
         return KnownSurface(torch.where(depth > 0, 1 / depth.clamp_min(1e-12), 0), normal)
 
     model = before.stage.finished(given)
+    drawn_by = dump(before.primitive), before.stage.near, versions(run.recipe)  # depth is not of the points alone
     prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)
-    known = KnownSurfaces(see, digest([model[name] for name in sorted(model)]))
+    known = KnownSurfaces(see, digest([str(drawn_by), *(model[name] for name in sorted(model))]))
     device = ctx.rasterizer.where().type
     with made_maps(run, estimator, scene, prints, ctx.caches, device, known) as folder:
         if folder is None:

@@ -10,13 +10,16 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.core.tree import evolve
 from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.depth.fill_monocular import MonocularFill
 from surfkit.depth.filled import Filled
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_map_index import read_made
 from surfkit.losses.depth import DepthRegression
+from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.raster.select import select
+from surfkit.runs import run_refinements
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import load_run, run
@@ -122,15 +125,84 @@ def test_interrupted_in_every_part_and_gone_on_with(farm, recipe, tmp_path, own_
     assert (tmp_path / "out/point_cloud.ply").read_bytes() == (tmp_path / "whole/point_cloud.ply").read_bytes()
 
 
+def test_a_stage_that_goes_on_with_other_maps_says_so(farm, recipe, tmp_path, own_cache, monkeypatch):
+    save, text = checkpoint.save, "refine0: what depth maps are made from, or how, has changed"
+
+    def stop(path, state):
+        save(path, state)
+        if path.parent.name == "refine0":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint, "save", stop)
+    for _ in range(2):  # after 2 of 5 steps, and after 4
+        with pytest.raises(KeyboardInterrupt):
+            run(evolve(recipe, "refine.0.stage.steps", 5), farm, tmp_path, Compute("cpu"), EVERY)
+        assert text not in (tmp_path / "run.json").read_text()
+    monkeypatch.setattr(checkpoint, "save", save)
+    monkeypatch.setattr(PatchMatch, "version", 1000)
+    run(evolve(recipe, "refine.0.stage.steps", 5), farm, tmp_path, Compute("cpu"), EVERY)
+    assert text in (tmp_path / "run.json").read_text()
+
+
 def test_a_second_refinement_makes_maps_anew_and_fills_them(farm, recipe, tmp_path, own_cache):
     twice = replace(recipe, refine=(REFINED, replace(REFINED, depth=Filled(stereo=QUICK))))
     run(twice, farm, tmp_path, Compute("cpu"), EVERY)
     assert [read_made(folder).maps for folder in (own_cache / "depth").iterdir()] == [7, 7]
 
 
-def test_maps_may_not_be_made(farm, recipe, tmp_path):
-    with pytest.raises(BadInput, match=r"refine\.0: it makes depth maps; leave out --no-prepare"):
-        run(recipe, farm, tmp_path, Compute("cpu"), EVERY, CacheSettings(maps=None))
+def test_other_depth_of_the_same_points_gives_other_maps(farm, recipe, tmp_path, own_cache, monkeypatch):
+    """Points that were trained to the same bits, without a loss on depth, but drawn otherwise, or by other code."""
+    recipe, made = replace(recipe, primitive=Gaussian3D(sh_degree=0)), []
+    for name, geometry, version in (
+        ("axis", "axis", "1"),
+        ("plane", "plane", "1"),
+        ("new", "plane", "2"),
+        ("again", "plane", "2"),
+    ):
+        monkeypatch.setattr(run_refinements, "versions", lambda _, version=version: {"surfkit": version})
+        run(evolve(recipe, "primitive.geometry", geometry), farm, tmp_path / name, Compute("cpu"), EVERY)
+        made.append(len(list((own_cache / "depth").iterdir())))
+    points = [
+        checkpoint.load_last(tmp_path / name / "pretrain" / "checkpoint.safetensors")[0] for name in ("axis", "plane")
+    ]
+    torch.testing.assert_close(*(state.points.params for state in points), rtol=0, atol=0)
+    assert made == [1, 2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    ("refine", "caches", "told"),
+    [
+        (REFINED, CacheSettings(maps=None), r"--no-prepare: refine\.0 makes depth maps"),
+        (
+            replace(REFINED, depth=replace(QUICK, window=17, scale=4)),
+            None,
+            r"refine\.0 cannot make its depth maps: .*window",
+        ),
+        (
+            replace(REFINED, depth=Filled(stereo=QUICK, fill=MonocularFill(maps="/nowhere"))),
+            None,
+            r"refine\.0 cannot make its depth maps: fill\.maps is /nowhere",
+        ),
+        (REFINED, None, r"cannot be written .*SURFKIT_CACHE to a folder for depth maps, or leave refine\.0 out"),
+    ],
+)
+def test_maps_that_cannot_be_made_are_told_before_anything_is_trained(
+    farm, recipe, tmp_path, own_cache, monkeypatch, refine, caches, told
+):
+    if "SURFKIT_CACHE" in told:
+        (tmp_path / "file").write_text("no folder")
+        monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "file"))
+    with pytest.raises(BadInput, match=told):
+        run(replace(recipe, refine=(refine,)), farm, tmp_path / "out", Compute("cpu"), EVERY, caches)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_refined_run_needs_no_maps_any_more_until_it_is_made_longer(farm, recipe, tmp_path, own_cache):
+    none = CacheSettings(maps=None)
+    run(recipe, farm, tmp_path, Compute("cpu"), EVERY)
+    run(recipe, farm, tmp_path, Compute("cpu"), EVERY, none)
+    with pytest.raises(BadInput, match="--no-prepare"):
+        run(evolve(recipe, "pretrain.steps", 8), farm, tmp_path, Compute("cpu"), EVERY, none)
 
 
 @pytest.mark.parametrize("wrong", [{"depth": PlaneSweep()}, {"depth": DepthAnythingV2()}, {"stage": Stage()}])
