@@ -16,6 +16,7 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_map_index import read_made
+from surfkit.io.datasets.fingerprint import digest
 from surfkit.losses.depth import DepthRegression
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.raster.select import select
@@ -224,3 +225,12 @@ def test_the_maps_of_a_run_are_another_thing(farm, recipe, tmp_path):
         )
     ]
     assert keys[0] == keys[1] != keys[2]
+
+
+def test_a_model_that_differs_anywhere_has_maps_of_its_own():
+    """In words, long arrays are cut short: models would share their maps."""
+    params = {"means": torch.zeros(5000, 3), "opacities": torch.zeros(5000)}
+    other = params | {"means": params["means"].clone()}
+    other["means"][2500, 1] = 1e-3
+    keys = {digest(["axis", *one.values()]) for one in (params, other)} | {digest(["plane", *params.values()])}
+    assert len(keys) == 3
