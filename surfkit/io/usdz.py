@@ -7,6 +7,7 @@ files begin at multiples of 64 bytes.
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Sequence
@@ -24,6 +25,8 @@ SCENE_NAME = "scene.usdc"
 """Of the scene in an archive."""
 NOTES = "surfkit"
 """Key in the custom data of the layer, under which files say how to read them back."""
+ARCHIVE_TIME_S = 315_619_200
+"""Of all files in an archive: 2 January 1980, which archives can have in every time zone."""
 MAX_ARCHIVE_BYTES = 2**32 - 1
 """Of a ZIP archive without the extension for larger ones, which USDZ does not have."""
 SCENE_SUFFIXES = (b".usdc", b".usda", b".usd")
@@ -78,7 +81,8 @@ def write_usdz(path: Path, stage: Any, files: Sequence[Path] = ()) -> None:
         if sum(file.stat().st_size + 256 for file in (scene, *files)) > MAX_ARCHIVE_BYTES:
             raise BadInput(f"{path}: more than 4 GiB, which such a file cannot have; take another format, or fewer")
         writer = Sdf.ZipFileWriter.CreateNew(str(archive))
-        for file in (scene, *files):
+        for file in (scene, *(shutil.copyfile(file, Path(folder) / file.name) for file in files)):
+            os.utime(file, (ARCHIVE_TIME_S, ARCHIVE_TIME_S))  # which is stored: the same content gives the same bytes
             writer.AddFile(str(file), file.name)
         writer.Save()
         with archive.open("rb+") as written:

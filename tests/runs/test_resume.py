@@ -300,7 +300,7 @@ class Spoiling(Prune):
 
     def edit(self, points, step):
         if step.index == self.at and step.rates["scales"] > self.above:
-            points.params["scales"][0] = float("nan")
+            points.params["scales"].data[0] = float("nan")  # as a fault of numbers would: a part may not
 
 
 def spoilt(recipe, at, above, monkeypatch):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 import torch
 
+from surfkit.core.check import BadInput
 from surfkit.partition.assign import Assign, PictureShare
 from surfkit.partition.base import Cells, Ground, Partition
 from surfkit.start.base import InitialModel, Start
@@ -101,7 +102,6 @@ class Rolls(Sparse):
         (Guesses(), "Guesses.expected is 40000, .* 400 "),
         (Lacks(), "Lacks.model has .*400 points .*quats"),
         (Fewer(), r"Fewer.model has the columns .*\(399, 3\)"),
-        (Learnt(), "Learnt.model: sh_degree is 4, not 0 to 3"),
         (Rolls(), r"Rolls.model is not repeatable: params\['quats'\]"),
     ],
 )
@@ -109,6 +109,11 @@ def test_starts_that_are_wrong(start, message):
     check_start(Sparse())
     with pytest.raises(AssertionError, match=message):
         check_start(start)
+
+
+def test_a_degree_that_no_model_has_is_refused_where_it_is_given():
+    with pytest.raises(BadInput, match="begin with sh_degree 4"):
+        check_start(Learnt())
 
 
 @dataclass(frozen=True)

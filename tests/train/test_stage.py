@@ -282,7 +282,7 @@ class Spoiling(Prune):
 
     def edit(self, points, step):
         if step.index == 3:
-            points.params["scales"][5, 1] = float("inf")
+            points.params["scales"].data[5, 1] = float("inf")  # as a fault of numbers would: a part may not
 
 
 def test_parameters_that_are_not_finite_name_step_and_view(begin):
