@@ -173,6 +173,8 @@ def _feed(found: Any, value: Any) -> None:
             array = array.astype("<f4") if array.dtype.kind == "f" else array
         found.update(f"\0{array.dtype.str}{array.shape}".encode())
         found.update(np.ascontiguousarray(array).tobytes())
+    elif isinstance(value, dict) and any(isinstance(each, (Tensor, np.ndarray)) for each in value.values()):
+        _feed(found, [part for item in sorted(value.items()) for part in item])
     elif isinstance(value, (list, tuple)) and any(isinstance(each, (Tensor, np.ndarray)) for each in value):
         found.update(f"\0{len(value)}".encode())  # in words, long arrays are cut short
         for each in value:

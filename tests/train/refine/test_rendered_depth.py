@@ -234,3 +234,4 @@ def test_a_model_that_differs_anywhere_has_maps_of_its_own():
     other["means"][2500, 1] = 1e-3
     keys = {digest(["axis", *one.values()]) for one in (params, other)} | {digest(["plane", *params.values()])}
     assert len(keys) == 3
+    assert digest(params) != digest(other) and digest(params) == digest(dict(reversed(params.items())))
