@@ -13,7 +13,7 @@ from surfkit.primitives.columns import Column
 from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Columns
 from surfkit.primitives.smoothing import Smoothable
-from surfkit.raster.api import DILATION, Splats
+from surfkit.raster.api import ALONG_RAYS, DILATION, Splats
 from surfkit.scene.scene import SparsePoints
 
 
@@ -30,17 +30,20 @@ class Gaussian3D(Smoothable, Primitive):
     """Variance that is added to the footprint of a splat in an image, px^2: 0.3 in 3DGS, 0.1 in Mip-Splatting. Files of
     splats do not hold it: other programs add 0.3."""
 
-    geometry: Literal["axis", "plane", "ray"] = "axis"
+    geometry: Literal["axis", "plane", "ray", "solid"] = "axis"
     """Normals and densities. axis: projected as in 3DGS, the shortest axis is the normal; plane: projected, the normal
-    is that of the plane that gives the depth (RaDe-GS); ray: the largest density along each ray, not projected (GOF).
+    is that of the plane that gives the depth (RaDe-GS); ray: the largest density along each ray, not projected (GOF);
+    solid: as ray, with the median depth of stochastic solids, for losses and meshers that read the median depth (GGGS).
     Files of splats do not hold it: other programs draw as axis."""
 
     def __post_init__(self) -> None:
         Smoothable.__post_init__(self)
         if not 0 < self.dilation < float("inf"):
             raise BadInput(f"primitive.dilation is {self.dilation:g}; it must be above 0")
-        if self.antialias and self.geometry == "ray":
-            raise BadInput("primitive.antialias makes up for the blur of the projection, and geometry ray has none")
+        if self.antialias and self.geometry in ALONG_RAYS:
+            raise BadInput(
+                f"primitive.antialias makes up for the blur of the projection, and geometry {self.geometry} has none"
+            )
 
     def columns(self) -> dict[str, Column]:
         """The standard ones, and the sampling intervals if scales are smoothed."""

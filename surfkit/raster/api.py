@@ -40,8 +40,11 @@ DILATION = 0.3
 PRIMITIVE_KINDS = ("surfel", "gaussian")
 """What the rasterizers of surfkit draw: flat discs (2DGS) and ellipsoids (3DGS)."""
 
-GEOMETRIES = ("axis", "plane", "ray")
+GEOMETRIES = ("axis", "plane", "ray", "solid")
 """How ellipsoids are evaluated; see `Splats.geometry`."""
+
+ALONG_RAYS = ("ray", "solid")
+"""Geometries that evaluate ellipsoids in space, along each ray, and not their footprints."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Splats:
         geometry: Gaussians only. "axis": footprint by EWA splatting, the normal is the shortest axis. "plane": the same
             footprint, the normal is that of the plane that gives the depth (RaDe-GS). "ray": density and depth at the
             largest density along each ray, without EWA and dilation, the normal is that of the ellipsoid there (GOF).
+            "solid": the same, and the median depth is that of stochastic solids (GGGS); see `Maps.median`.
         extra: Further tensors (N, ...) by name, for primitives that draw themselves.
         shared: Further tensors that belong to no splat.
     """
@@ -149,7 +153,10 @@ class Maps:
         color: (3, H, W) sum of w_i c_i over black.
         alpha: (H, W) sum of w_i, which is 1 - T at the end.
         depth: (H, W) sum of w_i z_i; divide by alpha for the expected depth.
-        median: (H, W) depth of the last splat met while T > 0.5; 0 where T never falls to 0.5.
+        median: (H, W) depth of the last splat met while T > 0.5; 0 where T never falls to 0.5. Of geometry "solid": the
+            depth t where T(t) of stochastic solids is 0.5 (GGGS, eq. 10 to 12), which moves with all splats of the ray
+            (eq. 13); 0 also where it is not within 40 % of that depth. Where T falls by less than a factor e over the
+            whole way at the rate it has there, it has no gradient.
         normal: (3, H, W) sum of w_i n_i, camera frame, n_i facing the camera.
         distortion: (H, W) sum over pairs j < i of w_i w_j (1 / z_i - 1 / z_j)^2.
     """
@@ -223,8 +230,8 @@ class Gradients:
     Attributes:
         means, quats, scales, opacities, sh0, sh_rest: Shapes of `Splats`.
         signal: (N, 2) of the total loss.
-        chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels; None if no second
-            cotangent was given.
+        chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels, of the depth of solids
+            apart from those of the other maps; None if no second cotangent was given.
         extra: By the `extra` and `shared` tensors of the splats that have an influence, by name.
         derived: The splats that were drawn in place of these, and their signal; None where these were drawn.
     """

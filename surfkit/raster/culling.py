@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import CUTOFF, Splats
+from surfkit.raster.api import ALONG_RAYS, CUTOFF, Splats
 from surfkit.raster.splat_boxes import SplatBoxes
 from surfkit.scene.camera import Camera
 
@@ -31,7 +31,7 @@ def may_touch(splats: Splats, camera: Camera, near: float) -> Tensor:
     """
     pose = camera.world_to_camera.to(splats.means)
     reach = splats.scales.amax(1) * (CUTOFF * (1 + BOUND_ROUNDING))
-    if splats.kind == "gaussian" and splats.geometry != "ray":
+    if splats.kind == "gaussian" and splats.geometry not in ALONG_RAYS:
         return _blurred(splats, splats.means @ pose[:3, :3].T + pose[:3, 3], reach, camera, near)
     planes = torch.tensor([*image_sides(camera), [0.0, 0.0, 1.0]]).to(pose)  # the last: the depth
     beyond = torch.addmm(planes @ pose[:3, 3], splats.means, (planes @ pose[:3, :3]).T)
@@ -70,7 +70,7 @@ def _planes(boxes: SplatBoxes, camera: Camera) -> tuple[list[list[float]], Tenso
     """Unit normals of the planes through the camera beside the image, pointing away, camera frame; (4,) the share of
     the reach that counts at each."""
     sides = ((camera.fx, camera.cx, camera.width, 0), (camera.fy, camera.cy, camera.height, 1))
-    is_blurred = boxes.kind == "gaussian" and boxes.geometry != "ray"
+    is_blurred = boxes.kind == "gaussian" and boxes.geometry not in ALONG_RAYS
     margin = SPLAT_MARGIN_PX + (CUTOFF * math.sqrt(boxes.dilation) if is_blurred else 0.0)
     normals, shares = [], []
     for focal, principal, pixels, axis in sides:

@@ -364,12 +364,15 @@ struct RayAdder {
         }
         return {r, u};
     }
-    SURFKIT_INLINE void add(const RayPixel& at, const LocalRay& local, Floats, Floats, Mask m, Floats e, Floats dz) {
-        Floats t{};
-        if (level >= kGeometry) t = keep(at.free_z & m, dz);
-        const Floats kept = keep(m, e);
-        const Shares g = shares(at, local, kept, t);
-        // Moments in sigmas: those in pixels cancel in the long direction of a needle, which no dilation makes wider.
+    static SURFKIT_INLINE Shares bent_shares(const RayPixel& at, const LocalRay& local, Floats e, Floats t, Floats c) {
+        Shares g = shares(at, local, e, t);
+        const Floats by_d = 2.0f * c * at.inv;
+        g.r = madd(by_d, broadcast(local.kappa), g.r);
+        g.u = madd(by_d, at.u, g.u);
+        return g;
+    }
+    // Moments in sigmas: those in pixels cancel in the long direction of a needle, which no dilation makes wider.
+    SURFKIT_INLINE void add_moments(const RayPixel& at, const Shares& g) {
         const Floats gp = -(g.r * at.p), gq = -(g.r * at.q);
         s[0] += gp;
         s[1] += gq;
@@ -379,6 +382,18 @@ struct RayAdder {
         s[6] += g.u;
         s[7] = madd(g.u, at.dx, s[7]);
         s[8] = madd(g.u, at.dy, s[8]);
+    }
+    SURFKIT_INLINE void add_signal(const RayPixel& at, const Shares& g, const LocalSignal& f) {
+        const Floats gx = madd(g.u, f.x[2], -(g.r * madd(at.dx, f.x[0], at.dy * f.x[1])));
+        const Floats gy = madd(g.u, f.y[2], -(g.r * madd(at.dx, f.y[0], at.dy * f.y[1])));
+        s[24] += chosen == kChosenAbsolute ? magnitude(gx) : gx;
+        s[25] += chosen == kChosenAbsolute ? magnitude(gy) : gy;
+    }
+    SURFKIT_INLINE void add(const RayPixel& at, const LocalRay& local, Floats, Floats, Mask m, Floats e, Floats dz) {
+        Floats t{};
+        if (level >= kGeometry) t = keep(at.free_z & m, dz);
+        const Floats kept = keep(m, e);
+        add_moments(at, shares(at, local, kept, t));
         Floats k = -0.5f * kept * (at.r * at.inv) * (at.r * at.inv);
         if (level >= kGeometry) {
             const Floats tu = t * at.u * at.inv;
@@ -391,11 +406,18 @@ struct RayAdder {
                                    Mask m, Floats e, Floats dz) {
         Floats t{};
         if (chosen != kChosenColor && level >= kGeometry) t = keep(at.free_z & m, dz);
-        const Shares g = shares(at, local, keep(m, e), t);
-        const Floats gx = madd(g.u, f.x[2], -(g.r * madd(at.dx, f.x[0], at.dy * f.x[1])));
-        const Floats gy = madd(g.u, f.y[2], -(g.r * madd(at.dx, f.y[0], at.dy * f.y[1])));
-        s[24] += chosen == kChosenAbsolute ? magnitude(gx) : gx;
-        s[25] += chosen == kChosenAbsolute ? magnitude(gy) : gy;
+        add_signal(at, shares(at, local, keep(m, e), t), f);
+    }
+    // The same with `c`, the gradient by the curve D / (kappa z^2) times that curve: see solids.h.
+    SURFKIT_INLINE void add_bent(const RayPixel& at, const LocalRay& local, Floats e, Floats dz, Floats c) {
+        add_moments(at, bent_shares(at, local, e, dz, c));
+        const Floats ratio = at.r * at.inv, tu = dz * at.u * at.inv;
+        s[5] += tu - c * (2.0f / local.z);
+        s[9] += c * ratio - c * (1.0f / local.kappa) - ratio * (0.5f * e * ratio + tu * local.z);
+    }
+    SURFKIT_INLINE void add_chosen_bent(const RayPixel& at, const LocalRay& local, const LocalSignal& f, Floats e,
+                                        Floats dz, Floats c) {
+        add_signal(at, bent_shares(at, local, e, dz, c), f);
     }
     // By the vector that the normal is the direction of, and times the offset.
     SURFKIT_INLINE void add_normal(const RayPixel& at, const Floats v[3]) {

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import ALPHA_MIN, CUTOFF, Splats
+from surfkit.raster.api import ALONG_RAYS, ALPHA_MIN, CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.rotations import rotations
 
@@ -24,7 +24,7 @@ EDGE_ON = 2e-3
 """Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
 
 MIN_FOOTPRINT = 1e-6
-"""Pixels: ellipsoids of geometry "ray" whose standard deviation on the screen is below this in a direction are not
+"""Pixels: ellipsoids along rays whose standard deviation on the screen is below this in a direction are not
 drawn, as nothing widens them there."""
 
 
@@ -42,6 +42,10 @@ class ProjectedSplats:
         radius: (N,) pixels, half the larger side of the contour's own box, the low-pass disc's at least.
         screen: What the densification signal is the gradient of: (N, 3, 3) homographies or (N, 2) centres.
         normals: (rows, x, y) to normals (n, P, 3) that differ from pixel to pixel; None where `normal` holds.
+        peaks: (rows, x, y, shift) to where the density is largest along each ray and, of solids, how fast it falls: rho
+            grows by curve times the squared distance of depths; (n, P) each. None where no median depth of solids is
+            wanted.
+        near: Nothing nearer to the camera is a depth.
         at: (rows, x, y, shift) to rho, depth and opacity, (n, P), (n, P) and (n, 1), at P pixel positions; shift is
             added to what the signal is the gradient of, (n, P, 2) or 0.
     """
@@ -56,13 +60,15 @@ class ProjectedSplats:
     screen: Tensor
     at: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
     normals: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+    peaks: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
+    near: float = 0.0
 
 
 def footprints(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     """Project splats of any kind and geometry."""
     if splats.kind == "surfel":
         return surfels(splats, camera, near)
-    return (along_rays if splats.geometry == "ray" else gaussians)(splats, camera, near)
+    return (along_rays if splats.geometry in ALONG_RAYS else gaussians)(splats, camera, near)
 
 
 def sh_basis(directions: Tensor, count: int) -> Tensor:
@@ -272,16 +278,25 @@ def along_rays(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
         reach = CUTOFF * scales.amax(1)
         z_low, z_high = (z - reach).clamp_min(near)[:, None], (z + reach)[:, None]
 
-    def at(rows: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def ray_of(rows: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The camera, the ray and how far it is turned from that through the centre; (n, 1, 3), (n, P, 3) twice."""
         offset = torch.stack([x[None] - screen[rows, :1], y[None] - screen[rows, 1:]], -1) - shift
-        # The ray is that through the centre and an offset; what the former adds to the cross product is 0.
         turned = torch.einsum("nij,npj->npi", into[rows][:, :, :2], offset / focal)
         start = origin[rows][:, None]
-        ray = turned - start / z[rows][:, None, None]
+        return start, turned - start / z[rows][:, None, None], turned
+
+    def at(rows: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        start, ray, turned = ray_of(rows, x, y, shift)
         a, b = (ray**2).sum(-1), 2 * (start * ray).sum(-1)
+        # What the ray through the centre adds to the cross product is 0.
         rho = torch.linalg.cross(start.expand_as(turned), turned).square().sum(-1) / a / least[rows] ** 2
         depth = -b / (2 * a)
         return rho, clamped(depth, z_low[rows], z_high[rows]), splats.opacities[rows][:, None]
+
+    def peaks(rows: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+        start, ray, _ = ray_of(rows, x, y, shift)
+        a = (ray**2).sum(-1)
+        return -(start * ray).sum(-1) / a, a / least[rows] ** 2
 
     def normals(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
         ray = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
@@ -291,4 +306,8 @@ def along_rays(splats: Splats, camera: Camera, near: float) -> ProjectedSplats:
     normal = facing(axes[torch.arange(len(z)), :, scales.argmin(1)], centre.detach())
     radius = half.amax(1)
     middle = screen.detach() + off
-    return ProjectedSplats(drawn, z, colors(splats, camera), normal, middle, half, radius, screen, at, normals)
+    return ProjectedSplats(
+        *(drawn, z, colors(splats, camera), normal, middle, half, radius, screen, at, normals),
+        peaks=peaks if splats.geometry == "solid" else None,
+        near=near,
+    )

@@ -17,6 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, T_MIN, Gradients, Maps, Render, Splats
 from surfkit.raster.base import Rasterizer
 from surfkit.raster.projection import ProjectedSplats, footprints
+from surfkit.raster.solids import Solids
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -119,6 +120,12 @@ def _blend(
     total = weight.sum(0)
     middle, opaque = _median(alpha, before, total)
     median = torch.where(opaque, depth.gather(0, middle[None])[0], 0.0)
+    if prints.peaks is not None:
+        moved = x.new_zeros(2) if shift is None else shift
+        rho, _, opacity = prints.at(rows, x, y, moved)
+        solids = Solids(opacity * torch.exp(-rho / 2), *prints.peaks(rows, x, y, moved))
+        median, unsure = solids.depth(median.detach(), prints.near)
+        risky = risky | unsure
     inverse = 1 / depth
     shift = inverse.detach().mean(0)  # a pair's difference does not change with it, its rounding does
     inverse = inverse - shift
@@ -257,7 +264,10 @@ class ReferenceRender(Render):
         return torch.where(self.seen[:, None], gradient * self._half_image, 0.0)
 
     def _sizes(self, cotangents: Maps) -> Tensor:
-        """(N, 2) sums over the pixels of the size of each pixel's gradient: every pixel has a shift of its own."""
+        """(N, 2) sums over the pixels of the size of each pixel's gradient: every pixel has a shift of its own.
+
+        What the depth of solids adds has a size for itself.
+        """
         prints, camera = self._drawn.footprints, self._camera
         shape, total = (camera.height, camera.width), torch.zeros_like(self._leaves["means"][:, :2])
         sizes = {"color": 3, "alpha": 1, "depth": 1, "median": 1, "normal": 3, "distortion": 1}
@@ -268,6 +278,8 @@ class ReferenceRender(Render):
                 for name, n in sizes.items()
             ]
         )
+        median = (torch.arange(10) == 5).to(total)
+        groups = [torch.ones_like(median)] if prints.peaks is None else [1 - median, median]
         for x0, y0, x1, y1 in _tiles(camera):
             rows, x, y = _in_tile(prints, (x0, y0, x1, y1), True), *_pixels((x0, y0, x1, y1), total.dtype)
             if not len(rows):
@@ -275,6 +287,8 @@ class ReferenceRender(Render):
             with torch.enable_grad():
                 shift = total.new_zeros(len(rows), len(x), 2).requires_grad_()
                 block, *_ = _blend(prints, rows, x, y, shift)
-                (share,) = torch.autograd.grad(block, shift, planes[:, y0:y1, x0:x1].reshape(10, -1))
-            total[rows] += share.abs().sum(1)
+            given_here = planes[:, y0:y1, x0:x1].reshape(10, -1)
+            for some in groups:
+                (share,) = torch.autograd.grad(block, shift, given_here * some[:, None], retain_graph=True)
+                total[rows] += share.abs().sum(1)
         return total

@@ -25,7 +25,7 @@ constexpr double kAntialiasFloor = 2.5e-5;
 constexpr double kMinFootprint = 1e-6;  // px, of gaussians along rays, which nothing widens
 
 // How gaussians are evaluated; see `Splats.geometry` in raster/api.py.
-enum Geometry { kAxis = 0, kPlane = 1, kRay = 2 };
+enum Geometry { kAxis = 0, kPlane = 1, kRay = 2, kSolid = 3 };  // from kRay on along rays
 
 // ---- small vectors
 
@@ -527,7 +527,7 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
                                Gaussian<R>& o) {
     const Vec<R> c = p.c;
     if (!(c.z > cam.near)) return false;
-    const bool rays = form.geometry == kRay;
+    const bool rays = form.geometry >= kRay;
     const R tan_x = R(0.5) * cam.width / cam.fx, tan_y = R(0.5) * cam.height / cam.fy;
     const R dx = c.x / c.z, dy = c.y / c.z;
     o.x = cam.fx * dx + cam.cx;

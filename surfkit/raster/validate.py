@@ -7,7 +7,7 @@ import math
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, PRIMITIVE_KINDS, Splats
+from surfkit.raster.api import ALONG_RAYS, GEOMETRIES, PRIMITIVE_KINDS, Splats
 
 
 def validate(splats: Splats, values: bool = True) -> None:
@@ -27,8 +27,10 @@ def validate(splats: Splats, values: bool = True) -> None:
             f"splats.geometry: {splats.geometry!r} of kind {splats.kind!r}; gaussians have {', '.join(GEOMETRIES)}, "
             "surfels only axis"
         )
-    if splats.geometry == "ray" and splats.antialias:
-        raise BadInput("splats.antialias: gaussians of geometry 'ray' have no dilation to make up for; leave it off")
+    if splats.geometry in ALONG_RAYS and splats.antialias:
+        raise BadInput(
+            f"splats.antialias: gaussians of geometry {splats.geometry!r} have no dilation to make up for; leave it off"
+        )
     count = len(splats)
     columns = 2 if splats.kind == "surfel" else 3
     wanted: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": ()}

@@ -13,14 +13,17 @@ from functools import partial
 
 import numpy as np
 
-from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, T_MIN, Splats
+from surfkit.raster.api import ALONG_RAYS, ALPHA_MAX, ALPHA_MIN, CUTOFF, T_MIN, Splats
 from surfkit.raster.projection import EDGE_ON
 from surfkit.scene.camera import Camera
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One splat in the camera's frame; `shape(x, y)` gives rho and depth at a pixel position."""
+    """One splat in the camera's frame.
+
+    `shape(x, y)` gives rho and depth at a pixel position, `density(p)` what it has at a place of that frame.
+    """
 
     index: int
     opacity: float
@@ -28,6 +31,7 @@ class Seen:
     normal: Callable[[float, float], np.ndarray]
     z: float
     shape: Callable[[float, float], tuple[float, float]]
+    density: Callable[[np.ndarray], float]
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
         if splats.kind == "surfel":
             made = surfel(centre, axes, scales[i], camera, near)
             opacity, normal = opacities[i], axes[:, 2]
-        elif splats.geometry == "ray":
+        elif splats.geometry in ALONG_RAYS:
             made = ellipsoid(centre, axes, scales[i], camera, near)
             opacity, normal = opacities[i], None
         else:
@@ -110,8 +114,39 @@ def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
             precision = axes @ np.diag(scales[i] ** -2) @ axes.T
             middle = partial(constant, -unit(precision @ centre))
             upright = middle if splats.geometry == "plane" else partial(across, precision, camera)
-        found.append(Seen(i, opacity, color, upright, centre[2], made))
+        found.append(
+            Seen(i, opacity, color, upright, centre[2], made, partial(density, centre, axes, scales[i], opacity))
+        )
     return sorted(found, key=lambda s: s.z)
+
+
+def density(centre, axes, scales, opacity, place: np.ndarray) -> float:
+    apart = place - centre
+    precision = axes @ np.diag(np.pad(scales, (0, 3 - len(scales)), constant_values=1) ** -2.0) @ axes.T
+    return opacity * math.exp(-apart @ precision @ apart / 2)
+
+
+def solid_depth(met: list[Seen], camera: Camera, x: float, y: float, start: float, near: float) -> float:
+    """Where half of the light gets through solids, within 40 % of `start`; 0 if nowhere (GGGS, eq. 10 to 12)."""
+    from scipy.optimize import brentq
+
+    ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0])
+
+    def vacancy(s: Seen, t: float) -> float:
+        return math.sqrt(1 - min(ALPHA_MAX, s.density(t * ray)))
+
+    def more_than_half(t: float) -> float:
+        left = 1.0
+        for s in met:
+            peak = s.shape(x, y)[1]
+            left *= vacancy(s, t) if t <= peak else vacancy(s, peak) ** 2 / vacancy(s, t)
+        return left - 0.5
+
+    low, high = 0.6 * start, 1.4 * start
+    if start == 0 or more_than_half(low) <= 0 or more_than_half(high) > 0:
+        return 0.0
+    found = float(brentq(more_than_half, low, high, xtol=1e-13, rtol=1e-13))
+    return found if found >= near else 0.0
 
 
 def surfel(centre, axes, scales, camera: Camera, near: float):
@@ -216,4 +251,8 @@ def evaluate(splats: Splats, camera: Camera, near: float) -> Plain:
             open_ *= 1 - alpha
         if open_ > 0.5:
             maps["median"][i, j] = 0
+        if splats.geometry == "solid":
+            x, y = j + 0.5, i + 0.5
+            met = [s for s in ordered if s.opacity * math.exp(-s.shape(x, y)[0] / 2) >= ALPHA_MIN]
+            maps["median"][i, j] = solid_depth(met, camera, x, y, maps["median"][i, j], near)
     return Plain(maps, blended)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import PRIMITIVE_KINDS, Splats
+from surfkit.raster.api import ALONG_RAYS, PRIMITIVE_KINDS, Splats
 from surfkit.scene.camera import Camera
 
 NEAR = 0.05
@@ -191,7 +191,7 @@ SCENES: dict[str, Callable[[str, int, int], tuple[Splats, Camera]]] = {
 FOR_GAUSSIANS = ("antialias", "undilated")
 CASES = [
     (name, kind)
-    for kind in (*PRIMITIVE_KINDS, "plane", "ray")
+    for kind in (*PRIMITIVE_KINDS, "plane", "ray", "solid")
     for name in SCENES
     if name not in FOR_GAUSSIANS or kind in ("gaussian", "plane")
 ]
@@ -204,7 +204,7 @@ def make(name: str, kind: str, degree: int | None = None, seed: int = 3) -> tupl
     if kind in PRIMITIVE_KINDS:
         return SCENES[name](kind, degree, seed)
     made, view = SCENES[name]("gaussian", degree, seed)
-    if (name, kind) == ("tiny", "ray"):  # nothing widens them: no pixel would see smaller ones
+    if name == "tiny" and kind in ALONG_RAYS:  # nothing widens them: no pixel would see smaller ones
         made = replace(made, scales=10 * made.scales)
     return replace(made, geometry=kind), view
 

@@ -231,8 +231,12 @@ def ptx() -> Callable[[CudaSource], dict[str, str]]:
     return made
 
 
-@pytest.mark.parametrize("kind", (SURFEL, GAUSSIAN, RAY))
-@pytest.mark.parametrize("name", ("project", "forward", "backward", "gather", "contribution"))
+FILES = ("project", "forward", "backward", "gather", "contribution")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [*((name, kind) for name in FILES for kind in (SURFEL, GAUSSIAN, RAY)), ("solid", RAY)]
+)
 def test_the_rasterizer_has_no_instruction_in_double(ptx, name, kind):
     """And those of its kernels that must find the same join no product and sum but where the source says so: one whose
     rounding is named is not joined with another."""

@@ -33,6 +33,10 @@ MISTAKES = {
         "backward", "const int column = fold", "if (lane == 7) continue; const int column = fold", 0, "shfl",
     ),
     "moments about the tile": ("backward", "if (is_moment) sum +=", "if (false) sum +=", 0, "wrong"),
+    "no barrier after staging solids": ("solid", BARRIER, "", 0, "of the block has written|with no barrier"),
+    "no barrier before the sum of warps, solids": ("solid", BARRIER, "", 2, "of the block has written|with no barrier"),
+    "rows of sums are written over": ("solid", "has_sums[j] ?", "false ?", 0, "wrong"),
+    "behind the peak as before it": ("solid", "select(front, -half, half)", "-half", 0, "wrong"),
     "one slot too many": ("gather", "slot < first[r + 1]", "slot <= first[r + 1]", 0, "index .* which has|wrong"),
     "no atomic": ("project", "atomicMin(&invalid[0], i)", "invalid[0] = i", 0, "wrong|another block|with no barrier"),
 }  # fmt: skip
@@ -63,7 +67,7 @@ class Broken(TileRasterizer):
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes(name):
-    c = case("opaque", "surfel")
+    c = case("opaque", "solid" if MISTAKES[name][0] == "solid" else "surfel")
     splats, is_larger = c.splats, "again" in name or "next batch" in name
     if name == "no atomic":
         splats = replace(splats, scales=-splats.scales)

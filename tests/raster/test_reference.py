@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.raster.api import Maps, Splats
+from surfkit.raster.api import ALONG_RAYS, Maps, Splats
 from surfkit.raster.projection import colors, footprints, gaussians, sh_basis
 from surfkit.raster.reference import Reference, draw
 
@@ -55,7 +55,7 @@ def test_maps_equal_a_plain_loop(name, kind):
         error = (value - torch.from_numpy(expected[key])).abs() * ~drawn.near_threshold
         # Where a ray nearly lies in the disc's plane, a rounding moves the hit by 1e7 times as much. The loop takes
         # B^2 / 4A from C as it stands in GOF's paper, and what is left is small against both.
-        assert error.max() < {("edge_on", "surfel"): 1e-7}.get((name, kind), 1e-8 if kind == "ray" else 1e-10), key
+        assert error.max() < {("edge_on", "surfel"): 1e-7}.get((name, kind), 1e-8 if kind in ALONG_RAYS else 1e-10), key
 
 
 @each_case
@@ -205,6 +205,7 @@ def few(kind: str, degree: int, antialias: bool = False, pixels: float = 8.0, ge
         ("gaussian", True, "axis"),
         ("gaussian", False, "plane"),
         ("gaussian", False, "ray"),
+        ("gaussian", False, "solid"),
     ],
 )
 def test_gradcheck_of_every_map_for_every_parameter(kind, antialias, geometry):

@@ -24,7 +24,7 @@ from surfkit.train.stage import Stage
 pytestmark = pytest.mark.usefixtures("compiled")
 
 
-@pytest.mark.parametrize("kind, geometry", [("surfel", "axis"), ("gaussian", "axis"), ("gaussian", "ray")])
+@pytest.mark.parametrize("kind, geometry", [("surfel", "axis"), ("gaussian", "axis"), ("gaussian", "solid")])
 def test_two_processes_draw_the_picture_of_one_and_get_its_gradients(kind, geometry):
     splats = crowd(kind, geometry)
     # the lower half is fuller, so that the strips move

@@ -53,7 +53,7 @@ SplatArrays shaded(const std::vector<Array>& s) {
 }
 
 Kind kind_of(bool surfel, splat::Geometry geometry) {
-    return surfel ? kSurfel : geometry == splat::kRay ? kGaussianRay : kGaussian;
+    return surfel ? kSurfel : geometry >= splat::kRay ? kGaussianRay : kGaussian;
 }
 
 splat::CameraModel<double> camera(const std::vector<double>& pose, const std::vector<double>& lens, int width,

@@ -25,6 +25,7 @@ struct Saved {
     int32_t* last;             // index in the tile's list of the last splat blended, -1 if none
     int32_t* middle;           // the same of the median depth
     float *m_shift, *m1, *m2;  // inverse depth of the first splat, and moments about it
+    float *solid, *fall;       // depth of solids, and how fast the light falls there, of its logarithm; 0 for no gradient
     uint64_t* blocks;          // per entry, the blocks of the tile that it was blended into; zero to begin with
 };
 
@@ -76,6 +77,11 @@ struct Kernels {
     // `sums` has one row of floats per slot; `touched` one byte per slot, set where the row was written.
     void (*backward)(Kind, Level, Chosen, const Job&, int64_t tile, const Planes& total, const Planes& chosen,
                      const Saved&, float* sums, uint8_t* touched);
+    // After `forward`, of gaussians along rays: the median depth becomes that of stochastic solids; where it is nearer
+    // than `near` there is none. After `backward`: adds what that depth hands back to the same sums.
+    void (*solid)(const Job&, int64_t tile, float near, const Planes& out, const Saved&);
+    void (*solid_backward)(Chosen, const Job&, int64_t tile, const Planes& total, const Planes& chosen, const Saved&,
+                           float* sums, uint8_t* touched);
     // Sum and count per slot of alpha^a T^b.
     void (*contribution)(Kind, const Job&, int64_t tile, float alpha_power, float open_power, float* sums,
                          uint8_t* touched);

@@ -236,7 +236,8 @@ Job Pass::job() const {
 }
 
 Saved Pass::saved() {
-    return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data(), blocks_.data()};
+    return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(),
+            m2_.data(),   solid_.data(), fall_.data(),  blocks_.data()};
 }
 
 std::vector<int64_t> Pass::pairs_by_row() const {
@@ -253,12 +254,17 @@ void Pass::forward(Level level, const Planes& out, int threads) {
     if (level >= kGeometry) middle_.resize(pixels);
     if (level >= kDistortion)
         for (auto* plane : {&m_shift_, &m1_, &m2_}) plane->resize(pixels);
+    const bool solids = solid() && level >= kGeometry;
+    if (solids)
+        for (auto* plane : {&solid_, &fall_}) plane->resize(pixels);
     blocks_.assign(pairs_, 0);
     const Saved kept = saved();
     const Job work = job();
     const Kernels& k = kernels();
-    parallel((int64_t)tiles_x_ * tiles_y_, threads,
-             [&](int64_t tile) { k.forward(kind_, level, work, tile, out, kept); });
+    parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
+        k.forward(kind_, level, work, tile, out, kept);
+        if (solids) k.solid(work, tile, (float)camera_.near, out, kept);
+    });
 }
 
 namespace {
@@ -302,6 +308,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
         if (absolute) what = kChosenAbsolute;
     }
+    const bool solids = solid() && (total.median || part.median);
     const Layout at = layout(kind_);
     const int width = chosen ? at.width_chosen : at.width, color_at = at.color_at, chosen_at = at.chosen_at;
     const Buffer<float> sums = buffer<float>(pairs_ * width);
@@ -312,6 +319,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     const Kernels& k = kernels();
     parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
         k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
+        if (solids) k.solid_backward(what, work, tile, total, part, kept, sums.get(), touched.data());
     });
     const int columns = scale_columns(kind_);
     const auto group = [&](int64_t from, int64_t end) {

@@ -50,6 +50,7 @@ class Pass {
     template <class Record>
     void project(const SplatArrays& splats, int threads, bool* seen, float* radii);
     void bin(int threads);
+    bool solid() const { return form_.geometry == splat::kSolid; }
     Job job() const;
     Saved saved();
     template <class F>
@@ -74,7 +75,7 @@ class Pass {
     std::vector<int64_t> offsets_;
     // Saved by forward.
     Level level_ = kColor;
-    std::vector<float> open_, m_shift_, m1_, m2_;
+    std::vector<float> open_, m_shift_, m1_, m2_, solid_, fall_;
     std::vector<int32_t> last_, middle_;
     std::vector<uint64_t> blocks_;
 };

@@ -1,7 +1,8 @@
 """The CUDA rasterizer: the kernels of this folder behind the contract of `raster.api`.
 
 Per view: `measure` finds which tiles each splat touches, `record` writes what blending needs of those that are seen, in
-the order of their depths, a stable sort by tile makes the lists, `forward` blends, `backward` and `gather` go back.
+the order of their depths, a stable sort by tile makes the lists, `forward` blends, `backward` and `gather` go back. Of
+stochastic solids `solid` and `solid_backward` come after `forward` and `backward`.
 Sums are taken in a fixed order, so that the same splats give the same bits each time.
 """
 
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.api import ALONG_RAYS, GEOMETRIES, MAPS, STANDARD, Gradients, Maps, Render, Splats
 from surfkit.raster.base import Rasterizer
 from surfkit.raster.culling import boxes_may_touch, image_sides, may_touch
 from surfkit.raster.nvrtc.cuda_source import CudaSource
@@ -95,6 +96,7 @@ class RasterPass:
 
     Attributes:
         arrays: The standard tensors of the splats.
+        are_solids: Whether the median depth is that of stochastic solids.
         seen, radii: As in `Render`.
         index: (M,) int64, the splat of each record: those seen, by depth.
         first: (M + 1,) int32, the first slot of each record; a slot is a pair of a splat and a tile.
@@ -114,7 +116,8 @@ class RasterPass:
         rim: float,
     ) -> None:
         validate(splats, values=False)
-        self.kind = SURFEL if splats.kind == "surfel" else RAY if splats.geometry == "ray" else GAUSSIAN
+        self.kind = SURFEL if splats.kind == "surfel" else RAY if splats.geometry in ALONG_RAYS else GAUSSIAN
+        self.are_solids = splats.geometry == "solid"
         self.program = partial(program, KIND=self.kind)  # which knows nothing of this pass: its tensors go with it
         self.device, self.home, self.view = device, splats.means.device, _view(splats, camera, near, rim)
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
@@ -218,6 +221,11 @@ class CudaRender(Render):
         forward.launch(
             "forward", self._pass.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *self._pass.lists, *outputs, *self._saved
         )
+        if self._pass.are_solids and self._level >= LEVEL_GEOMETRY:
+            self._solid = (plane(LEVEL_GEOMETRY), plane(LEVEL_GEOMETRY))
+            solid = self._pass.program("solid", LEVEL=LEVEL_GEOMETRY, CHOSEN=CHOSEN_NOTHING, WIDTH=SUMS[RAY])
+            given = *self._pass.lists, maps["median"], self._saved[2], *self._solid
+            solid.launch("solid", self._pass.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given)
         return maps
 
     def backward(
@@ -232,6 +240,11 @@ class CudaRender(Render):
         backward = drawn.program("backward", LEVEL=level, CHOSEN=what, WIDTH=width)
         given: tuple[Any, ...] = *drawn.lists, drawn.index, rows, *cotangents, *self._saved
         backward.launch("backward", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, touched)
+        medians = [each[MAPS.index("median")] for each in (cotangents[: len(MAPS)], cotangents[len(MAPS) :])]
+        if drawn.are_solids and any(map(len, medians)):
+            solid = drawn.program("solid", LEVEL=LEVEL_GEOMETRY, CHOSEN=what, WIDTH=width)
+            given = *drawn.lists, drawn.index, rows, *medians, *self._solid
+            solid.launch("solid_backward", drawn.tiles, TILE_SIDE_PX * TILE_SIDE_PX, *given, sums, touched)
         del given
         drawn.let_go()  # the gradients take about as much
         grads = [torch.zeros_like(each[:rows]) for each in arrays]

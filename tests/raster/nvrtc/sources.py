@@ -33,7 +33,7 @@ def changed(source: CudaSource, old: str, new: str, skip: int = 0) -> CudaSource
 
 def raster(name: str, kind: int = rasterizer.SURFEL) -> CudaSource:
     """Kernels of the rasterizer as most training steps use them: all maps, and a signal of the colours alone."""
-    on_the_way_back = name in ("backward", "gather")
+    on_the_way_back = name in ("backward", "gather", "solid")
     width = {"WIDTH": rasterizer.SUMS[kind] + 4} if on_the_way_back else {}
     width |= {"COEFFICIENTS": 16} if name in ("project", "gather") else {}
     return rasterizer.source(name, KIND=kind, LEVEL=rasterizer.LEVEL_DISTORTION, CHOSEN=int(on_the_way_back), **width)
@@ -50,6 +50,7 @@ SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),
     (raster("gather"), {"gather": (168, 0)}),
+    (raster("solid", rasterizer.RAY), {"solid": (128, 13_000), "solid_backward": (128, 40_000)}),
     (raster("contribution"), {"contribution": (80, 7_000), "leading": (80, 6_000), "total": (56, 0), "probe": (56, 0)}),
 )
 """Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have; and

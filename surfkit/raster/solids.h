@@ -1,0 +1,126 @@
+// The depth of gaussians as stochastic solids (Zhang et al. 2026, GGGS), per pixel, once for every backend.
+//
+// Along a ray the density of a gaussian is G(t) = G* exp(-curve (t - peak)^2 / 2), with the alpha of a picture, G*, at its
+// peak. As a solid it leaves open v = sqrt(1 - G) up to the peak and v*^2 / v behind it (eq. 12). The depth is where all
+// of them together leave a half (eq. 10, 11). Squares are multiplied here: T^2, which is to be a quarter.
+#pragma once
+
+#include "pixels.h"
+
+namespace surfkit {
+namespace {
+
+// A search looks between some shares of a depth that is near, or at first else in a wider range; then it divides the
+// interval into parts, and ends with Newton's method.
+constexpr int kShares = 6, kParts = 8, kNarrowings = 3, kNewton = 3;
+SPLAT_FN float share_of(bool wide, int k) {
+    constexpr float shares[2][kShares] = {{0.96f, 0.99f, 0.998f, 1.002f, 1.01f, 1.04f},
+                                          {0.6f, 0.8f, 0.96f, 1.04f, 1.2f, 1.4f}};
+    return shares[wide][k];
+}
+// Where a gaussian counts at all: so many times its CUTOFF from its centre it is below what a float tells from 0.
+constexpr float kReach = 1.8f;
+SPLAT_FN float front_of(const LocalRay& s) { return s.z - kReach * (s.z_high - s.z); }
+SPLAT_FN float back_of(const LocalRay& s) { return s.z + kReach * (s.z_high - s.z); }
+// Where the light falls by less than a factor e over the whole way from the camera, depth has no gradient: eq. 13 divides
+// by that fall, and a surface takes a thousandth of the way or less.
+constexpr float kLeastFall = 1.0f;
+
+struct SolidPixel {
+    RayPixel at;
+    Floats raw, alpha, peak, curve;
+    Mask drawn;
+
+    SURFKIT_INLINE void shape(const LocalRay& s, Floats x, Floats y) {
+        at.shape(s, x, y);
+        raw = s.opacity * exp_negative(-at.half_rho);
+        alpha = lower(raw, broadcast(kAlphaMax));
+        drawn = less_equal(kAlphaMin, alpha);
+    }
+    // With d the ray in units of the axes, z = 1 along it: curve = d.d, of which D / (kappa z^2) is another name.
+    SURFKIT_INLINE void place(const LocalRay& s) {
+        peak = keep(drawn, s.z * at.u * at.inv);
+        curve = keep(drawn, reciprocal(at.inv * (s.kappa * s.z * s.z)));
+    }
+    // G at depth t, not yet held at kAlphaMax.
+    SURFKIT_INLINE Floats density(Floats t) const {
+        const Floats off = t - peak;
+        return raw * exp_negative(-0.5f * lower(curve * off * off, broadcast(100.0f)));
+    }
+    // The square of what is left open up to depth t.
+    SURFKIT_INLINE Floats open_squared(Floats t) const {
+        const Floats vacancy = 1.0f - lower(density(t), broadcast(kAlphaMax)), all = 1.0f - alpha;
+        const Floats left = select(less_equal(t, peak), vacancy, all * all * reciprocal(vacancy));
+        return select(drawn, left, broadcast(1.0f));
+    }
+    // -d(log T) / dt at depth t, of this one.
+    SURFKIT_INLINE Floats fall(Floats t) const {
+        const Floats g = density(t);
+        return keep(drawn & lesser(g, kAlphaMax), 0.5f * g * reciprocal(1.0f - g) * curve * magnitude(t - peak));
+    }
+};
+
+// The search of some pixels.
+struct Crossing {
+    Floats low{}, high{}, t{};
+    Mask found = lesser(broadcast(1.0f), 0.0f);
+
+    // From how many of the shares of `start` are left more than half open.
+    SURFKIT_INLINE void begin(Floats start, Floats count, bool wide) {
+        const Mask within = lesser(0.5f, count) & lesser(count, kShares - 0.5f) & lesser(0.0f, start);
+        for (int k = 0; k < kShares - 1; k++) {
+            const Mask here = without(within & less_equal(k + 0.5f, count) & less_equal(count, k + 1.5f), found);
+            low = select(here, start * share_of(wide, k), low);
+            high = select(here, start * share_of(wide, k + 1), high);
+        }
+        found = less_equal(low, high) & lesser(0.0f, high);
+    }
+    SURFKIT_INLINE Floats inner(int k) const { return madd(high - low, broadcast((float)(k + 1) / kParts), low); }
+    SURFKIT_INLINE void narrow(Floats count) {
+        const Floats part = (high - low) * (1.0f / kParts);
+        low = madd(part, count, low);
+        high = low + part;
+        t = madd(part, broadcast(0.5f), low);
+    }
+    // By the square of what is open at t, and the fall of its logarithm.
+    SURFKIT_INLINE void newton(Floats left, Floats fall) {
+        const Mask is_open = lesser(0.25f, left);
+        low = select(is_open, t, low);
+        high = select(is_open, high, t);
+        const Floats step = 2.0f * (left - 0.25f) * reciprocal(higher(fall, broadcast(1e-20f)));
+        t = higher(low, lower(high, t + step));
+    }
+    SURFKIT_INLINE Floats depth(float near) const { return keep(found & less_equal(near, t), t); }
+};
+
+// What one solid does to the depth t of pixels: eq. 13, dt/d(theta) = d(log T)/d(theta) / fall. `by_log` is dL/dt / fall.
+struct SolidShares {
+    Floats by_power, by_peak, by_curve;  // dL/d(rho / 2), dL/d(peak), and dL/d(curve) times the curve
+
+    static SURFKIT_INLINE SolidShares of(const SolidPixel& p, Floats t, Floats by_log) {
+        const Floats g = p.density(t), off = t - p.peak;
+        const Mask front = less_equal(t, p.peak);
+        const Floats half = 0.5f * by_log * g * reciprocal(1.0f - lower(g, broadcast(kAlphaMax)));
+        const Floats by_density = keep(p.drawn & lesser(g, kAlphaMax), select(front, -half, half));
+        const Floats all = by_log * p.raw * reciprocal(1.0f - p.alpha);
+        const Floats by_peak_density = keep(without(p.drawn & lesser(p.raw, kAlphaMax), front), -all);
+        const Floats bent = by_density * p.curve * off;
+        return {-(by_density + by_peak_density), bent, -0.5f * bent * off};
+    }
+};
+
+// Adds to a RayAdder what a pixel's depth hands back to one solid, and its share of the chosen signal.
+template <class Adder, int chosen>
+SURFKIT_INLINE void add_solid(const SolidPixel& p, const LocalRay& s, const LocalSignal& signal, Floats t,
+                              Floats by_log, Floats chosen_by_log, Adder& adder) {
+    const SolidShares g = SolidShares::of(p, t, by_log);
+    adder.add_opacity(-g.by_power * (1.0f / s.opacity));
+    adder.add_bent(p.at, s, g.by_power, g.by_peak, g.by_curve);
+    if (chosen == kChosenAll || chosen == kChosenAbsolute) {
+        const SolidShares c = SolidShares::of(p, t, chosen_by_log);
+        adder.add_chosen_bent(p.at, s, signal, c.by_power, c.by_peak, c.by_curve);
+    }
+}
+
+}  // namespace
+}  // namespace surfkit
