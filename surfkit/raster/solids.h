@@ -14,9 +14,9 @@ namespace {
 // interval into parts, and ends with Newton's method.
 constexpr int kShares = 6, kParts = 8, kNarrowings = 3, kNewton = 3;
 SPLAT_FN float share_of(bool wide, int k) {
-    constexpr float shares[2][kShares] = {{0.96f, 0.99f, 0.998f, 1.002f, 1.01f, 1.04f},
-                                          {0.6f, 0.8f, 0.96f, 1.04f, 1.2f, 1.4f}};
-    return shares[wide][k];
+    const int step = k < kShares / 2 ? kShares / 2 - k : k + 1 - kShares / 2;
+    const float off = step == 1 ? (wide ? 0.04f : 0.002f) : step == 2 ? (wide ? 0.2f : 0.01f) : (wide ? 0.4f : 0.04f);
+    return k < kShares / 2 ? 1 - off : 1 + off;
 }
 // Where a gaussian counts at all: so many times its CUTOFF from its centre it is below what a float tells from 0.
 constexpr float kReach = 1.8f;

@@ -1,10 +1,14 @@
 """Ellipsoids as stochastic solids: against their attenuation integrated along each ray, and compiled against that."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from needs import needs_native
 
+from surfkit.raster.api import Maps
+from surfkit.raster.native_rasterizer import NativeRasterizer
 from surfkit.raster.rays import ray_opacity, ray_opacity_reference
 
 from .scenes import NEAR, SCENES, double, make
@@ -119,6 +123,53 @@ def test_where_peaks_lie_behind_it_is_the_product_of_vacancies():
     vacancy = (1 - 0.9 * torch.exp(-apart / 0.02)).sqrt().prod()
     assert float(1 - ray_opacity_reference(two, view, NEAR, place, solid=True)) == pytest.approx(float(vacancy))
     assert float(1 - ray_opacity(two, view, NEAR, place, solid=True)) == pytest.approx(float(vacancy), abs=1e-6)
+
+
+@needs_native
+@pytest.mark.parametrize("name", ("plain", "huge", "opaque"))
+def test_the_median_depth_is_where_half_is_left(name):
+    splats, view = make(name, "solid")
+    maps = NativeRasterizer().render(splats, view, NEAR).maps
+    first = NativeRasterizer().render(replace(splats, geometry="ray"), view, NEAR).maps.median
+    depth = maps.median.double()
+    seen = depth > 0
+    assert seen.sum() > 0.8 * (first > 0).sum() > 100 and not (seen & (first == 0)).any()
+    assert ((depth - first).abs() > 1e-3)[seen].float().mean() > 0.5, "it is not the median of splatting"
+
+    def hidden(share):
+        points = ((view.rays(torch.float64) * depth * share)[:, seen].T - view.world_to_camera[:3, 3]) @ turn
+        return ray_opacity(splats, view, NEAR, points, solid=True)
+
+    turn = view.world_to_camera[:3, :3]
+    # Densities below ALPHA_MIN count in the depth, and not in what is asked here.
+    assert ((hidden(1.0) - 0.5).abs() < 0.02).float().mean() > 0.95
+    assert (hidden(0.98) < 0.5).float().mean() > 0.95 and (hidden(1.02) > 0.5).float().mean() > 0.95
+
+
+@needs_native
+@pytest.mark.parametrize("opacity", [0.4, 0.6, 0.9])
+def test_the_depth_of_one_ball_and_its_gradient(opacity):
+    """Before the centre where G is 3/4, behind it where (1 - o) / sqrt(1 - G) is 1/2; none where it hides less."""
+    ball, view = one_ball(opacity)
+    view = replace(view, cx=20.5, cy=16.5)
+    values = {name: value.float() for name, value in ball.tensors().items()}
+    drawn = NativeRasterizer().render(replace(ball, **values, geometry="solid"), view, NEAR)
+    depth = float(drawn.maps.median[16, 20])
+    if opacity < 0.5:
+        assert not drawn.maps.median.any()
+        return
+
+    def told(o):
+        density = 0.75 if o >= 0.75 else 1 - 4 * (1 - o) ** 2
+        return 2 + np.sign(0.75 - o) * 0.1 * np.sqrt(2 * np.log(o / density))
+
+    assert depth == pytest.approx(told(opacity), abs=1e-6)
+    one = torch.zeros_like(drawn.maps.median)
+    one[16, 20] = 1
+    found = drawn.backward(Maps(median=one))
+    along = view.world_to_camera[2, :3].float()
+    assert torch.allclose(found.means[0], along, atol=1e-4), "it moves with the ball"
+    assert float(found.opacities) == pytest.approx((told(opacity + 1e-5) - told(opacity - 1e-5)) / 2e-5, rel=1e-3)
 
 
 @needs_native

@@ -24,14 +24,14 @@ from surfkit_gggs.mesher import SolidField, SolidTSDF
 
 GGGS = Recipe(
     about="Ellipsoids with losses between views, and their mesh as stochastic solids (GGGS, Zhang et al. 2026)",
-    primitive=Gaussian3D(geometry="ray", smoothing=0.2),
+    primitive=Gaussian3D(geometry="solid", smoothing=0.2),
     pretrain=Stage(
         losses={
             "l1": L1(),
             "ssim": SSIM(),
             "normal": NormalConsistency(weight=0.05, start=7_000, depth="median"),
-            "reprojection": Reprojection(weight=0.02, start=7_000, every=1),
-            "patches": WarpedPatches(weight=0.6, start=7_000, every=1, pixels=102_400),
+            "reprojection": Reprojection(weight=0.02, start=7_000, every=1, depth="median"),
+            "patches": WarpedPatches(weight=0.6, start=7_000, every=1, pixels=102_400, depth="median"),
         },
         appearance=Exposure(),
         signal=AbsGradient(),

@@ -8,7 +8,6 @@ from typing import ClassVar
 import torch
 
 from surfkit.mesh.opacity_surface import OpacitySurface
-from surfkit.mesh.solid_depth import solid_depth
 from surfkit.plugin import TSDF, BadInput, Maps, Mesh, Mesher, MeshInput, View, Warned, emit
 from surfkit.primitives.drawing import PrimitiveRasterizer
 
@@ -34,9 +33,10 @@ class SolidField(OpacitySurface):
 class SolidTSDF(Mesher):
     """Fuse depth as mesh:tsdf does, but where half of each ray is left open by stochastic solids (GGGS, eq. 10).
 
-    It takes the place of the median depth; normals and colours are those that are drawn. Splats other than Gaussians
-    keep their median depth, with a warning. `facts` of the mesh tell the share of the pixels with a median depth in
-    which none of solids was found.
+    Of a model of `primitive:gaussian3d` with `geometry solid` mesh:tsdf does the same. Of others it takes the place of
+    the median depth; normals and colours are those that are drawn. Splats other than Gaussians keep their median depth,
+    with a warning. `facts` of the mesh tell the share of the pixels with a median depth in which none of solids was
+    found.
     """
 
     fusion: TSDF = field(default_factory=TSDF)
@@ -56,15 +56,16 @@ class SolidTSDF(Mesher):
         if not are_solids(subject):
             emit(Warned(f"mesh:gggs-tsdf: {subject.splats.kind} splats are no solids; their median depth is fused"))
             return self.fusion.mesh(subject)
+        solids = replace(subject.splats, geometry="solid", antialias=False)
         pixels = {"drawn": 0, "found": 0}
 
         def draw(view: View) -> Maps:
             with torch.no_grad():
                 maps = subject.draw(view)
-                median = maps.need("median")
-                depth = solid_depth(subject.splats, view.camera, subject.near, median)
+                drawn = subject.rasterizer.render(solids, view.camera, subject.near, distortion=False).maps
+            median, depth = maps.need("median"), drawn.need("median")
             pixels["drawn"] += int((median > 0).sum())
-            pixels["found"] += int((depth > 0).sum())
+            pixels["found"] += int(((depth > 0) & (median > 0)).sum())
             return replace(maps, median=depth.to(median))
 
         mesh = self.fusion.mesh(replace(subject, draw=draw, draw_of=None))

@@ -25,6 +25,8 @@ def test_the_weights_are_those_of_the_paper():
     early, late = GGGS.pretrain.weights_at(7_000), GGGS.pretrain.weights_at(7_001)
     assert early.keys() == {"l1", "ssim"}
     assert (late["normal"], late["patches"], late["reprojection"]) == (0.05, 0.6, 0.02)
+    assert GGGS.primitive.geometry == "solid"
+    assert {GGGS.pretrain.losses[name].depth for name in ("normal", "reprojection", "patches")} == {"median"}
     GGGS.refuse_unfit()
 
 

@@ -76,6 +76,7 @@ solid(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries,
         for (int i = 0; i < kShares; i++) left[i] = 1;
         const bool is_wanted = start > 0 && !search.found;
         look(is_wanted, start * share_of(wide, kShares - 1), [&](const SolidPixel& solid) {
+#pragma unroll
             for (int i = 0; i < kShares; i++) left[i] *= solid.open_squared(start * share_of(wide, i));
         });
         for (int i = 0; i < kShares; i++) open += left[i] > 0.25f ? 1.0f : 0.0f;
