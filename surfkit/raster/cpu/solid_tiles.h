@@ -1,6 +1,8 @@
 // Depths of the pixels of a tile where half of the light gets through gaussians as stochastic solids; see ../solids.h.
 #pragma once
 
+#include <vector>
+
 #include "../solids.h"
 #include "kernels.h"
 #include "tiles.h"
@@ -13,156 +15,116 @@ SURFKIT_INLINE void each_bit(uint64_t blocks, F f) {
     for (; blocks; blocks &= blocks - 1) f(__builtin_ctzll(blocks));
 }
 
-// A splat of a tile's list as its pixels see it.
+// A splat of a tile's list, and those of some blocks that it may touch: none if it lies behind `far`.
 struct Solid {
     LocalRay local;
-    float sx, sy, front, back;
+    float sx, sy, front;
     uint64_t blocks;
 
-    // Those of the `blocks` that it may touch; none if it lies behind `far`.
     Solid(const Tile& tile, const RayRecord& s, float far, uint64_t wanted)
-        : local(LocalRay::of(s, tile.ox - s.ax, tile.oy - s.ay)), sx(local.sx), sy(local.sy), front(front_of(local)),
-          back(back_of(local)), blocks(front < far ? touched_blocks(s, sx, sy) & wanted : 0) {}
-    // False if it is not drawn at a pixel of the block.
+        : local(LocalRay::of(s, tile.ox - s.ax, tile.oy - s.ay)),
+          sx(local.sx),
+          sy(local.sy),
+          front(front_of(local)),
+          blocks(front < far ? touched_blocks(s, sx, sy) & wanted : 0) {}
     SURFKIT_INLINE bool at(int block, SolidPixel& pixel) const {
-        pixel.shape(local, lanes().x[block], lanes().y[block]);
-        if (!any(pixel.drawn)) return false;
-        pixel.place(local);
-        return true;
+        return pixel.shape(local, lanes().x[block], lanes().y[block]);
     }
 };
+inline float largest_of(Floats v) {
+    float most = v[0];
+    for (int l = 1; l < kLanes; l++) most = v[l] > most ? v[l] : most;
+    return most;
+}
 
-// The least and the largest depth that some pixels of a block are looked at.
-struct Interval {
-    float low = 1e30f, high = 0;
-    void add(const Floats& from, const Floats& to, Mask which) {
-        const uint32_t on = bits(which);
-        for (int l = 0; l < kLanes; l++)
-            if (on >> l & 1) low = from[l] < low ? from[l] : low, high = to[l] > high ? to[l] : high;
-    }
-};
-
-// The search in a tile. What lies before all depths that a block is looked at is multiplied once, into `base`.
+// The search of a block: what its rays meet, less and less of it.
 struct SolidSearch {
-    const Tile& tile;
-    Crossing crossing[kBlocks];
-    Floats start[kBlocks], at[kBlocks][kParts], left[kBlocks][kParts], base[kBlocks], fall[kBlocks];
-    float counted[kBlocks];  // up to where `base` holds what lies before
-    Interval interval[kBlocks];
+    std::vector<OnRay>& met;
+    Floats base = broadcast(1.0f);  // the square of what those leave open that lie before all depths in question
+    Crossing crossing;
+    Floats fall{};
 
-    SolidSearch(const Tile& t) : tile(t) {
-        for (int b = 0; b < kBlocks; b++) counted[b] = -1e30f, base[b] = broadcast(1.0f), start[b] = fall[b] = Floats{};
-    }
-    // What is left open at `count` depths of the pixels of some blocks, in growing order; with `falls` of one, and the
-    // fall there too.
-    void look(uint64_t blocks, int count, bool falls) {
-        float far = 0;
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            far = interval[b].high > far ? interval[b].high : far;
-            if (interval[b].low < counted[b]) counted[b] = -1e30f, base[b] = broadcast(1.0f);
-            for (int i = 0; i < count; i++) left[b][i] = broadcast(1.0f);
-            fall[b] = Floats{};
-        });
-        for (int64_t k = tile.begin; k < tile.end && blocks; k++) {
-            fetch<Rays, 8>(tile, k);
-            const Solid solid(tile, record_of<Rays>(tile, k), far, blocks);
-            each_bit(solid.blocks, [&](int bit) {
-                const int b = block_at(bit);
-                SolidPixel pixel;
-                if (solid.back < counted[b] || interval[b].high < solid.front || !solid.at(b, pixel)) return;
-                if (solid.back < interval[b].low) {
-                    base[b] = base[b] * pixel.open_squared(interval[b].low + Floats{});
-                    return;
-                }
-                for (int i = 0; i < count; i++) left[b][i] = left[b][i] * pixel.open_squared(at[b][i]);
-                if (falls) fall[b] = fall[b] + pixel.fall(at[b][0]);
-            });
+    // Of depths between `low` and `high`, where they are in question.
+    void keep_between(Floats low, Floats high, Mask which) {
+        size_t kept = 0;
+        for (const OnRay& one : met) {
+            const Mask before = one.lies_before(low);
+            if (!any(without(which, before))) {
+                base = base * one.behind();
+            } else if (any(without(which, one.lies_behind(high)))) {
+                met[kept++] = one;
+            }
         }
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            counted[b] = interval[b].low > counted[b] ? interval[b].low : counted[b];
-            for (int i = 0; i < count; i++) left[b][i] = left[b][i] * base[b];
-        });
+        met.resize(kept);
     }
-    Floats open_ones(int b, int count) const {
-        Floats sum{};
-        for (int i = 0; i < count; i++) sum = sum + keep(lesser(0.25f, left[b][i]), broadcast(1.0f));
-        return sum;
-    }
-    // Finds intervals for those pixels that have none yet; the blocks where some have one.
-    uint64_t begin(uint64_t blocks, bool wide) {
-        uint64_t wanted = 0, found = 0;
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            const Mask lacking = without(lesser(0.0f, start[b]), crossing[b].found);
-            if (!any(lacking)) return;
-            wanted |= 1ull << bit;
-            for (int i = 0; i < kShares; i++) at[b][i] = start[b] * share_of(wide, i);
-            interval[b] = {};
-            interval[b].add(at[b][0], at[b][kShares - 1], lacking);
-        });
-        look(wanted, kShares, false);
-        each_bit(wanted, [&](int bit) {
-            const int b = block_at(bit);
-            crossing[b].begin(start[b], open_ones(b, kShares), wide);
-        });
-        each_bit(blocks, [&](int bit) {
-            if (any(crossing[block_at(bit)].found)) found |= 1ull << bit;
-        });
-        return found;
-    }
-    void bracketed(uint64_t blocks) {
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            interval[b] = {};
-            interval[b].add(crossing[b].low, crossing[b].high, crossing[b].found);
-        });
-    }
-    void narrow(uint64_t blocks) {
-        bracketed(blocks);
-        each_bit(blocks, [&](int bit) {
-            for (int i = 0; i < kParts - 1; i++) at[block_at(bit)][i] = crossing[block_at(bit)].inner(i);
-        });
-        look(blocks, kParts - 1, false);
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            crossing[b].narrow(open_ones(b, kParts - 1));
-        });
-    }
-    void newton(uint64_t blocks) {
-        bracketed(blocks);
-        each_bit(blocks, [&](int bit) { at[block_at(bit)][0] = crossing[block_at(bit)].t; });
-        look(blocks, 1, true);
-        each_bit(blocks, [&](int bit) {
-            const int b = block_at(bit);
-            crossing[b].newton(left[b][0], fall[b]);
-        });
+    // About `start`, where it is not 0.
+    void look(Floats start, bool wide) {
+        Floats at[kShares], left[kShares];
+        for (int i = 0; i < kShares; i++) at[i] = start * share_of(wide, i);
+        keep_between(at[0], at[kShares - 1], lesser(0.0f, start));
+        for (int i = 0; i < kShares; i++) left[i] = base;
+        for (const OnRay& one : met)
+            for (int i = 0; i < kShares; i++) left[i] = left[i] * one.open_squared(at[i]);
+        crossing.begin(start, left, wide);
+        if (any(crossing.found)) keep_between(crossing.low, crossing.high, crossing.found);
+        for (int i = 0; i < kSteps && any(crossing.unsettled()); i++) {
+            Floats open = base;
+            fall = Floats{};
+            for (const OnRay& one : met) {
+                open = open * one.open_squared(crossing.t);
+                fall = fall + one.fall(crossing.t);
+            }
+            crossing.newton(open, fall);
+        }
     }
 };
 
 // Puts these depths in the place of the median ones, about which the search begins, and keeps them and the fall of the
 // light there for the way back. Then no single splat is that of the median.
 inline void solid_tile(const Tile& tile, float near, const Planes& out, const Saved& saved) {
-    SolidSearch search(tile);
-    uint64_t blocks = 0;
+    thread_local std::vector<OnRay> met[kBlocks];
+    Floats start[kBlocks] = {}, depth[kBlocks] = {}, fall[kBlocks] = {};
+    uint64_t wanted = 0;
     each_bit(tile.inside(), [&](int bit) {
         const int b = block_at(bit);
-        search.start[b] = tile.read(out.median, b);
-        if (any(lesser(0.0f, search.start[b]))) blocks |= 1ull << bit;
+        start[b] = tile.read(out.median, b);
+        if (any(lesser(0.0f, start[b]))) wanted |= 1ull << bit;
     });
-    uint64_t found = search.begin(blocks, false);
-    found = search.begin(blocks, true);
-    for (int i = 0; i < kNarrowings; i++) search.narrow(found);
-    for (int i = 0; i < kNewton; i++) search.newton(found);
+    for (int wide = 0; wide < 2; wide++) {
+        float far = 0;
+        each_bit(wanted, [&](int bit) {
+            met[block_at(bit)].clear();
+            const float most = largest_of(start[block_at(bit)]) * share_of(wide, kShares - 1);
+            far = most > far ? most : far;
+        });
+        for (int64_t k = tile.begin; k < tile.end && wanted; k++) {
+            fetch<Rays, 8>(tile, k);
+            const Solid solid(tile, record_of<Rays>(tile, k), far, wanted);
+            each_bit(solid.blocks, [&](int bit) {
+                SolidPixel pixel;
+                if (solid.at(block_at(bit), pixel)) met[block_at(bit)].push_back(pixel);
+            });
+        }
+        uint64_t lacking = 0;
+        each_bit(wanted, [&](int bit) {
+            const int b = block_at(bit);
+            SolidSearch search{met[b]};
+            search.look(start[b], wide);
+            const Mask found = search.crossing.found;
+            depth[b] = select(found, search.crossing.depth(near), depth[b]);
+            fall[b] = select(found, search.fall, fall[b]);
+            start[b] = keep(without(lesser(0.0f, start[b]), found), start[b]);
+            if (any(lesser(0.0f, start[b]))) lacking |= 1ull << bit;
+        });
+        wanted = lacking;
+    }
     const Ints none = Ints{} - 1;
     each_bit(tile.inside(), [&](int bit) {
         const int b = block_at(bit);
-        const Floats depth = search.crossing[b].depth(near);
-        const Floats fall = keep(lesser(kLeastFall, search.fall[b] * depth), search.fall[b]);
-        tile.write(out.median, b, (const float*)&depth);
-        tile.write(saved.solid, b, (const float*)&depth);
-        tile.write(saved.fall, b, (const float*)&fall);
+        const Floats steep = keep(lesser(kLeastFall, fall[b] * depth[b]), fall[b]);
+        tile.write(out.median, b, (const float*)&depth[b]);
+        tile.write(saved.solid, b, (const float*)&depth[b]);
+        tile.write(saved.fall, b, (const float*)&steep);
         tile.write(saved.middle, b, (const int32_t*)&none);
     });
 }
@@ -183,10 +145,8 @@ void solid_backward_tile(const Tile& tile, const Planes& total, const Planes& pa
         blocks |= 1ull << bit;
         const Floats inverse = keep(falls, reciprocal(select(falls, fall, broadcast(1.0f))));
         depth[b] = tile.read(saved.solid, b);
-        Interval seen;
-        seen.add(depth[b], depth[b], falls);
-        farthest[b] = seen.high;
-        far = seen.high > far ? seen.high : far;
+        farthest[b] = largest_of(keep(falls, depth[b]));
+        far = farthest[b] > far ? farthest[b] : far;
         by_log[b] = tile.read(total.median, b) * inverse;
         chosen_by_log[b] = tile.read(part.median, b) * inverse;
     });

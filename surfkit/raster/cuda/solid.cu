@@ -47,9 +47,7 @@ inline void each_solid(const View& view, const Pixel& pixel, const Buffer<const 
             for (unsigned todo = __ballot_sync(kAllLanes, is_near); todo; todo &= todo - 1) {
                 const LocalRay local = locals[group + __ffs(todo) - 1];
                 SolidPixel solid;
-                solid.shape(local, pixel.dx, pixel.dy);
-                solid.place(local);
-                f(solid);
+                if (solid.shape(local, pixel.dx, pixel.dy)) f(solid);
             }
         }
     }
@@ -67,38 +65,29 @@ solid(View view, Buffer<const SplatRecord> records, Buffer<const Entry> entries,
     const Pixel pixel(view);
     const long long begin = offsets[pixel.tile], end = offsets[pixel.tile + 1];
     const float start = pixel.is_inside ? median[pixel.at] : 0.0f;
-    Crossing search;
+    Crossing search = {};
     const auto look = [&](bool is_wanted, float far, auto f) {
         each_solid(view, pixel, records, entries, begin, end, locals, reaches, is_wanted, far, f);
     };
     for (int wide = 0; wide < 2; wide++) {
-        float left[kShares], open = 0;
+        float left[kShares];
         for (int i = 0; i < kShares; i++) left[i] = 1;
         const bool is_wanted = start > 0 && !search.found;
         look(is_wanted, start * share_of(wide, kShares - 1), [&](const SolidPixel& solid) {
 #pragma unroll
             for (int i = 0; i < kShares; i++) left[i] *= solid.open_squared(start * share_of(wide, i));
         });
-        for (int i = 0; i < kShares; i++) open += left[i] > 0.25f ? 1.0f : 0.0f;
-        if (is_wanted) search.begin(start, open, wide);
-    }
-    for (int pass = 0; pass < kNarrowings; pass++) {
-        float left[kParts - 1], open = 0;
-        for (int i = 0; i < kParts - 1; i++) left[i] = 1;
-        look(search.found, search.high, [&](const SolidPixel& solid) {
-            for (int i = 0; i < kParts - 1; i++) left[i] *= solid.open_squared(search.inner(i));
-        });
-        for (int i = 0; i < kParts - 1; i++) open += left[i] > 0.25f ? 1.0f : 0.0f;
-        search.narrow(open);
+        if (is_wanted) search.begin(start, left, wide);
     }
     float falls = 0;
-    for (int pass = 0; pass < kNewton; pass++) {
-        float left = 1;
-        falls = 0;
+    for (int i = 0; i < kSteps && __syncthreads_or(search.unsettled()); i++) {
+        float left = 1, fall_here = 0;
         look(search.found, search.high, [&](const SolidPixel& solid) {
             left *= solid.open_squared(search.t);
-            falls += solid.fall(search.t);
+            fall_here += solid.fall(search.t);
         });
+        if (!search.unsettled()) continue;
+        falls = fall_here;
         search.newton(left, falls);
     }
     if (!pixel.is_inside) return;
@@ -161,10 +150,9 @@ solid_backward(View view, Buffer<const SplatRecord> records, Buffer<const Entry>
             const LocalRay local = locals[j];
             const LocalSignal signal = signals[j];
             SolidPixel solid;
-            solid.shape(local, pixel.dx, pixel.dy);
-            solid.place(local);
             Adder adder;
-            add_solid<Adder, CHOSEN>(solid, local, signal, t, by_log, chosen_by_log, adder);
+            if (solid.shape(local, pixel.dx, pixel.dy))
+                add_solid<Adder, CHOSEN>(solid, local, signal, t, by_log, chosen_by_log, adder);
             const int column = fold<WIDTH>(adder.s, lane);
             if (column < WIDTH) parts[(warp * kBatchBack + j) * WIDTH + column] = adder.s[0];
         }
