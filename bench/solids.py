@@ -3,8 +3,8 @@
     surfkit ablate bench/solids.py:solids --data SCENE --scale 4 --metres-per-unit 1 --test-every 8 --steps 1500 \
         --max-points 30000 --gt SCENE/gt/mesh.ply --tau 1
 
-The losses of geometry begin at step 400, as they would not in so few steps; all meshes are of depth maps, in the same way
-within each of the two groups.
+The losses of geometry begin at step 400, as they would not begin in so few steps. All meshes are of depth maps, made in
+one way within each of the two groups.
 """
 
 from __future__ import annotations
