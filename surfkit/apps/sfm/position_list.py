@@ -40,8 +40,9 @@ UNIT_METRES = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "usft", "ftus", "ussurveyfoot", "ussurveyfeet"), 0.3048),
 }
-"""Metres per unit that the name of the column of heights may state, as in `Altitude [ft]`; feet of both kinds differ by
-1 mm in 500 m."""
+"""Metres per unit that a name of a column of heights or accuracies may state, as `Altitude [ft]`; feet of both kinds
+differ by 1 mm in 500 m."""
+ACCURACY_COLUMNS = ("sx", "sy", "sxy", "sz")
 STATED_UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
 """What stands in brackets in the name of a column."""
 COMMENT = re.compile(r"#\s*(?:CoordinateSystem\s*:\s*)?(.*)", re.IGNORECASE)
@@ -128,18 +129,22 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
             where = f"{said}: line {row.at}" if row.cells.get("crs") else said if crs is None else "--positions-crs"
             systems[text] = _system(f"EPSG:{text}" if text.isdigit() else text, where)
         numbers = [_number(row.cells.get(axis), said, row, axis == "z") for axis in "xyz"]
-        if table.height_metres is not None and numbers[2] is not None:
-            numbers[2] *= table.height_metres / systems[text].height_metres
+        if "z" in table.metres and numbers[2] is not None:
+            numbers[2] *= table.metres["z"] / systems[text].height_metres
         name = row.cells["name"]
         if name in found and found[name][2] != numbers:
             raise BadInput(f"{said}: lines {found[name][0].at} and {row.at} give two positions for {name!r}; keep one")
         found[name] = (row, systems[text], numbers)
     if not found:
         raise BadInput(f"{said}: no positions; each line is {WANTED}")
-    if table.height_metres is None and any(numbers[2] is not None for _, _, numbers in found.values()):
+    if "z" not in table.metres and any(numbers[2] is not None for _, _, numbers in found.values()):
         _tell_unit(systems.values(), said)
     positions = _positions(found, said)
-    accuracies = {name: sigma for name in positions if (sigma := _accuracy(found[name][0], said)) is not None}
+    accuracies = {
+        name: sigma for name in positions if (sigma := _accuracy(found[name][0], said, table.metres)) is not None
+    }
+    if accuracies and not table.metres.keys() & set(ACCURACY_COLUMNS):
+        _tell_unit_of_accuracies(systems.values(), said)
     return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
 
 
@@ -152,6 +157,19 @@ def _tell_unit(systems: Iterable[System], said: str) -> None:
                 Warned(
                     f"{said}: {system.crs} has no heights of its own, so those of the list are taken in its unit, "
                     f"{axes.unit}; where they are in metres, name the column of heights 'z [m]'"
+                )
+            )
+
+
+def _tell_unit_of_accuracies(systems: Iterable[System], said: str) -> None:
+    """Say that accuracies are taken in metres where coordinates are in another unit and no column states one."""
+    for system in systems:
+        axes = None if system.degrees else known_axes(system.crs)
+        if axes is not None and axes.metres != 1:
+            emit(
+                Warned(
+                    f"{said}: accuracies are taken in metres, though {system.crs} is in {axes.unit}; where they are in "
+                    "feet, name their columns 'sxy [ft]' and 'sz [ft]'"
                 )
             )
 
@@ -171,18 +189,19 @@ class PositionTable:
         system: That a line before the positions names.
         rows: One for each photograph with a position.
         degrees: Whether names of columns say degrees.
-        height_metres: Metres per unit of heights that the name of their column states; None where it states none.
+        metres: Metres per unit of heights and accuracies, by column, where its name states a unit.
     """
 
     system: str | None
     rows: Sequence[PositionRow]
     degrees: bool
-    height_metres: float | None
+    metres: Mapping[str, float]
 
 
 def _table(lines: Sequence[str], said: str) -> PositionTable:
     """What the lines of a file say."""
-    system, header, degrees, height_metres = None, None, False, None
+    system, header, degrees = None, None, False
+    metres: dict[str, float] = {}
     rows: list[PositionRow] = []
     for at, line in enumerate(lines, 1):
         text = line.strip()
@@ -195,7 +214,7 @@ def _table(lines: Sequence[str], said: str) -> PositionTable:
             continue
         if not rows and header is None and (columns := _header(plain)) is not None:
             header, degrees = columns, any(_small(cell) in DEGREE_NAMES for cell in _split(plain))
-            height_metres = _stated_metres(plain, columns)
+            metres = _stated_metres(plain, columns)
             continue
         if comment:
             continue
@@ -214,7 +233,7 @@ def _table(lines: Sequence[str], said: str) -> PositionTable:
         if not row.cells.get("name"):
             raise BadInput(f"{said}: line {at} is {text[:60]!r}, not {WANTED}")
         rows.append(row)
-    return PositionTable(system, rows, degrees, height_metres)
+    return PositionTable(system, rows, degrees, metres)
 
 
 def _plain(cells: Sequence[str]) -> list[str]:
@@ -232,11 +251,15 @@ def _header(text: str) -> list[str] | None:
     return found if {"name", "x", "y"} <= set(found) else None
 
 
-def _stated_metres(text: str, columns: Sequence[str]) -> float | None:
-    """Metres per unit of heights that a line of names of columns states."""
-    name = next((cell for cell, column in zip(_split(text), columns, strict=True) if column == "z"), "")
-    stated = STATED_UNIT.search(name)
-    return UNIT_METRES.get(re.sub(r"[^a-z]", "", stated[1].lower())) if stated else None
+def _stated_metres(text: str, columns: Sequence[str]) -> dict[str, float]:
+    """Metres per unit that a line of names of columns states, of heights and accuracies."""
+    found = {}
+    for cell, column in zip(_split(text), columns, strict=True):
+        stated = STATED_UNIT.search(cell) if column in ("z", *ACCURACY_COLUMNS) else None
+        unit = UNIT_METRES.get(re.sub(r"[^a-z]", "", stated[1].lower())) if stated else None
+        if unit is not None:
+            found[column] = unit
+    return found
 
 
 def _small(cell: str) -> str:
@@ -308,9 +331,9 @@ def _positions(found: Mapping[str, tuple[PositionRow, System, list[float | None]
     return positions
 
 
-def _accuracy(row: PositionRow, said: str) -> tuple[float, float, float] | None:
-    """Standard deviations, if the row gives them across and up."""
-    across = row.cells.get("sxy")
-    texts = [row.cells.get("sx") or across, row.cells.get("sy") or across, row.cells.get("sz")]
-    found = tuple(_number(text, said, row) or 0.0 for text in texts if text and _is_number(text))
+def _accuracy(row: PositionRow, said: str, metres: Mapping[str, float]) -> tuple[float, float, float] | None:
+    """Standard deviations, metres, if the row gives them across and up."""
+    columns = ["sx" if row.cells.get("sx") else "sxy", "sy" if row.cells.get("sy") else "sxy", "sz"]
+    cells = [(row.cells.get(column), metres.get(column, 1.0)) for column in columns]
+    found = tuple((_number(text, said, row) or 0.0) * unit for text, unit in cells if text and _is_number(text))
     return found if len(found) == 3 and all(0 < value < MAX_ERROR_M for value in found) else None

@@ -48,10 +48,10 @@ struct SolidSearch {
     void keep_between(Floats low, Floats high, Mask which) {
         size_t kept = 0;
         for (const OnRay& one : met) {
-            const Mask before = one.lies_before(low);
-            if (!any(without(which, before))) {
+            const Mask here = which & lesser(0.0f, one.raw);
+            if (!any(without(here, one.lies_before(low)))) {
                 base = base * one.behind();
-            } else if (any(without(which, one.lies_behind(high)))) {
+            } else if (any(without(here, one.lies_behind(high)))) {
                 met[kept++] = one;
             }
         }

@@ -102,6 +102,19 @@ def test_heights_that_are_missing_blanks_in_names_and_accuracies(listed):
     assert found.accuracies == {"a": (0.1, 0.2, 0.3)}
 
 
+def test_accuracies_are_in_the_unit_that_their_column_states_else_in_metres(listed):
+    """Also where coordinates are in feet: Metashape and OpenDroneMap write accuracies in metres; it is said."""
+    row = "a,980000,200000,300,1,2"
+    with collect_notes() as notes:
+        assert listed(f"name,x,y,z [ft],sxy,sz\n{row}", "EPSG:2263").accuracies == {"a": (1, 1, 2)}
+    assert any("accuracies are taken in metres" in text for text in notes.texts)
+    with collect_notes() as notes:
+        found = listed(f"name,x,y,z [ft],sxy [ft],sz (m)\n{row}", "EPSG:2263")
+        assert found.accuracies["a"] == pytest.approx((0.3048, 0.3048, 2))
+        assert listed(METASHAPE).accuracies
+    assert not notes.texts
+
+
 @pytest.mark.parametrize("text", ["EPSG:4326\na.jpg 151.2 -33.9\nb.jpg 0 0", "WGS84 UTM 56S\na.jpg {e} {n}\nb.jpg 0 0"])
 def test_places_of_a_receiver_without_a_fix_are_left_out(listed, text):
     with collect_notes() as notes:
