@@ -10,7 +10,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive, harmonics
 from surfkit.primitives.columns import Column
-from surfkit.primitives.init import seeds
+from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.primitives.smoothing import Smoothable
 from surfkit.raster.api import ALONG_RAYS, DILATION, Splats
@@ -36,8 +36,14 @@ class Gaussian3D(Smoothable, Primitive):
     solid: as ray, with the median depth of stochastic solids, for losses and meshers that read the median depth (GGGS).
     Files of splats do not hold it: other programs draw as axis."""
 
+    first_thickness: float = 1.0
+    """Third axis of a new splat, along the normal where the start knows one, as a share of the other two; 1 begins with
+    balls."""
+
     def __post_init__(self) -> None:
         Smoothable.__post_init__(self)
+        if not 0 < self.first_thickness <= 1:
+            raise BadInput(f"primitive.first_thickness is {self.first_thickness:g}; it must be above 0 and at most 1")
         if not 0 < self.dilation < float("inf"):
             raise BadInput(f"primitive.dilation is {self.dilation:g}; it must be above 0")
         if self.antialias and self.geometry in ALONG_RAYS:
@@ -50,9 +56,15 @@ class Gaussian3D(Smoothable, Primitive):
         return self.smoothable_columns(3)
 
     def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
-        """Balls."""
+        """Balls; flatter ones along the cloud's normals."""
+        columns = self.columns()
+        params = seeds(columns, cloud)
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
-        return seeds(self.columns(), cloud) | {"quats": quats} | self.unobserved(len(quats))
+        if cloud.normals is not None:
+            quats, raw = facing(cloud.normals), params["scales"]
+            thin = columns["scales"].activation.times(raw[:, 2:], self.first_thickness)
+            params["scales"] = torch.cat([raw[:, :2], thin], 1)
+        return params | {"quats": quats} | self.unobserved(len(quats))
 
     def activate(self, params: Columns, degree: int) -> Splats:
         """Gaussians."""

@@ -13,7 +13,7 @@ namespace {
 // A search looks between some shares of a depth that is near, or at first else in a wider range; then it goes on by
 // Newton's method, by halves where that would leave the interval, until a step is a small share of the depth.
 constexpr int kShares = 6, kSteps = 24;
-constexpr float kSettled = 1e-6f;
+constexpr float kSettled = 2e-7f;
 SPLAT_FN float share_of(bool wide, int k) {
     const int step = k < kShares / 2 ? kShares / 2 - k : k + 1 - kShares / 2;
     const float off = step == 1 ? (wide ? 0.04f : 0.002f) : step == 2 ? (wide ? 0.2f : 0.01f) : (wide ? 0.4f : 0.04f);

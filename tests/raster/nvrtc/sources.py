@@ -50,7 +50,7 @@ SHIPPED: tuple[tuple[CudaSource, dict[str, tuple[int, ...]]], ...] = (
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),
     (raster("gather"), {"gather": (168, 0)}),
-    (raster("solid", rasterizer.RAY), {"solid": (80, 14_000), "solid_backward": (64, 33_000)}),
+    (raster("solid", rasterizer.RAY), {"solid": (88, 14_000), "solid_backward": (80, 33_000)}),
     (raster("contribution"), {"contribution": (80, 7_000), "leading": (80, 6_000), "total": (56, 0), "probe": (56, 0)}),
 )
 """Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have; and
