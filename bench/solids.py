@@ -35,9 +35,10 @@ def gggs(geometry: Literal["ray", "solid"], between: Depth) -> Recipe:
     return recipe
 
 
-def surface(geometry: Literal["ray", "solid"]) -> Recipe:
-    """recipe:surface of ellipsoids."""
-    return replace(SURFACE, primitive=Gaussian3D(sh_degree=1, geometry=geometry, smoothing=0.2))
+def surface(geometry: Literal["ray", "solid"], first_thickness: float = 1.0, smoothing: float = 0.2) -> Recipe:
+    """recipe:surface of ellipsoids, which begin as balls or thinner."""
+    primitive = Gaussian3D(sh_degree=1, geometry=geometry, smoothing=smoothing, first_thickness=first_thickness)
+    return replace(SURFACE, primitive=primitive)
 
 
 TABLES = {
@@ -52,6 +53,10 @@ TABLES = {
             Row("surface (discs)", recipe=SURFACE),
             Row("surface, ellipsoids", recipe=surface("ray"), on="surface (discs)"),
             Row("surface, solids", recipe=surface("solid"), on="surface, ellipsoids"),
+            Row("surface, solids that begin thin", recipe=surface("solid", 0.1), on="surface, solids"),
+            Row("surface, solids that begin thinner", recipe=surface("solid", 0.02), on="surface, solids"),
+            Row("surface, thin solids without smoothing", recipe=surface("solid", 0.1, 0), on="surface (discs)"),
+            Row("surface, thin ellipsoids without smoothing", recipe=surface("ray", 0.1, 0), on="surface (discs)"),
         ),
     )
 }

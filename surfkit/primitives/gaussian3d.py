@@ -56,11 +56,11 @@ class Gaussian3D(Smoothable, Primitive):
         return self.smoothable_columns(3)
 
     def init(self, cloud: SparsePoints, generator: torch.Generator) -> Columns:
-        """Balls; flatter ones along the cloud's normals."""
+        """Balls, or thinner along the cloud's normals where it has some."""
         columns = self.columns()
         params = seeds(columns, cloud)
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
-        if cloud.normals is not None:
+        if cloud.normals is not None and self.first_thickness < 1:
             quats, raw = facing(cloud.normals), params["scales"]
             thin = columns["scales"].activation.times(raw[:, 2:], self.first_thickness)
             params["scales"] = torch.cat([raw[:, :2], thin], 1)

@@ -95,6 +95,22 @@ def test_flat_gaussians_stay_flat():
             Flat3D(thickness=wrong)
 
 
+def test_ellipsoids_may_begin_thin_along_the_normals_of_the_cloud():
+    given = cloud(normals=True)
+    thin = Gaussian3D(first_thickness=0.1).init(given, torch.Generator())
+    axes = rotated(torch.tensor([[0.0, 0.0, 1.0]]).expand(50, 3), thin["quats"])
+    assert torch.allclose((axes * given.normals).sum(1).abs(), torch.ones(50), atol=1e-5)
+    scales = thin["scales"].exp()
+    assert torch.allclose(scales[:, 2], 0.1 * scales[:, 0]) and torch.equal(scales[:, 0], scales[:, 1])
+    balls = Gaussian3D().init(given, torch.Generator())
+    assert torch.equal(balls["scales"][:, :2], thin["scales"][:, :2]) and not balls["scales"].std(1).any()
+    anyhow = Gaussian3D(first_thickness=0.1).init(cloud(), torch.Generator())
+    assert not anyhow["scales"].std(1).any(), "no normals, no thin axis"
+    for wrong in (0.0, 1.5, float("nan")):
+        with pytest.raises(BadInput, match=r"primitive\.first_thickness is"):
+            Gaussian3D(first_thickness=wrong)
+
+
 @pytest.mark.parametrize("primitive", [Surfel2D(), Flat3D()], **names)
 def test_discs_face_the_normals_of_the_cloud(primitive):
     given = cloud(normals=True)

@@ -43,7 +43,12 @@ def case(name: str, kind: str, degree: int | None = None) -> Case:
     maps = true.maps.present()
     cotangents = {key: (draws.normal(*value.shape) * clear).float() for key, value in maps.items()}
     return Case(
-        shown, view, clear, true, cotangents, THIN_SOLIDS if kind == "solid" and name in ("needle", "tiny") else BACKWARD
+        shown,
+        view,
+        clear,
+        true,
+        cotangents,
+        THIN_SOLIDS if kind == "solid" and name in ("needle", "tiny") else BACKWARD,
     )
 
 
