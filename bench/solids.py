@@ -56,6 +56,7 @@ TABLES = {
             Row("surface, solids that begin thin", recipe=surface("solid", 0.1), on="surface, solids"),
             Row("surface, solids that begin thinner", recipe=surface("solid", 0.02), on="surface, solids"),
             Row("surface, thin solids without smoothing", recipe=surface("solid", 0.1, 0), on="surface (discs)"),
+            Row("surface, solids of a third without smoothing", recipe=surface("solid", 0.3, 0), on="surface (discs)"),
             Row("surface, thin ellipsoids without smoothing", recipe=surface("ray", 0.1, 0), on="surface (discs)"),
         ),
     )
