@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.primitives.base import Primitive, harmonics
 from surfkit.primitives.columns import Column
 from surfkit.primitives.init import facing, seeds
@@ -60,7 +61,14 @@ class Gaussian3D(Smoothable, Primitive):
         columns = self.columns()
         params = seeds(columns, cloud)
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
-        if cloud.normals is not None and self.first_thickness < 1:
+        if self.first_thickness < 1 and cloud.normals is None:
+            emit(
+                Warned(
+                    "primitive.first_thickness: the start knows no normals, so splats begin as balls; start:stereo knows "
+                    "them, or leave the option out"
+                )
+            )
+        elif self.first_thickness < 1 and cloud.normals is not None:
             quats, raw = facing(cloud.normals), params["scales"]
             thin = columns["scales"].activation.times(raw[:, 2:], self.first_thickness)
             params["scales"] = torch.cat([raw[:, :2], thin], 1)

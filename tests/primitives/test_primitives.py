@@ -11,6 +11,7 @@ from surfkit.primitives.base import Primitive, rotated
 from surfkit.primitives.edit import Edit, apply
 from surfkit.primitives.init import LONE_POINT_SIZE, MIN_POINT_SIZE, gaps
 from surfkit.primitives.points import Points
+from surfkit.runs.run_notes import collect_notes
 from surfkit.scene.scene import SparsePoints
 
 ALL = [Surfel2D(), Gaussian3D(), Flat3D()]
@@ -104,8 +105,11 @@ def test_ellipsoids_may_begin_thin_along_the_normals_of_the_cloud():
     assert torch.allclose(scales[:, 2], 0.1 * scales[:, 0]) and torch.equal(scales[:, 0], scales[:, 1])
     balls = Gaussian3D().init(given, torch.Generator())
     assert torch.equal(balls["scales"][:, :2], thin["scales"][:, :2]) and not balls["scales"].std(1).any()
-    anyhow = Gaussian3D(first_thickness=0.1).init(cloud(), torch.Generator())
-    assert not anyhow["scales"].std(1).any(), "no normals, no thin axis"
+    with collect_notes() as notes:
+        anyhow = Gaussian3D(first_thickness=0.1).init(cloud(), torch.Generator())
+        assert not anyhow["scales"].std(1).any(), "no normals, no thin axis"
+        Gaussian3D().init(cloud(), torch.Generator())
+    assert len(notes.texts) == 1 and "first_thickness: the start knows no normals" in notes.texts[0]
     for wrong in (0.0, 1.5, float("nan")):
         with pytest.raises(BadInput, match=r"primitive\.first_thickness is"):
             Gaussian3D(first_thickness=wrong)

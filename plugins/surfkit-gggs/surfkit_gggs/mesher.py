@@ -34,9 +34,9 @@ class SolidTSDF(Mesher):
     """Fuse depth as mesh:tsdf does, but where half of each ray is left open by stochastic solids (GGGS, eq. 10).
 
     Of a model of `primitive:gaussian3d` with `geometry solid` mesh:tsdf does the same. Of others it takes the place of
-    the median depth; normals and colours are those that are drawn. Splats other than Gaussians keep their median depth,
-    with a warning. `facts` of the mesh tell the share of the pixels with a median depth in which none of solids was
-    found.
+    the median depth; normals and colours are those that are drawn, and `facts` of the mesh tell the share of the pixels
+    with a median depth in which none of solids was found. Splats other than Gaussians keep their median depth, with a
+    warning.
     """
 
     fusion: TSDF = field(default_factory=TSDF)
@@ -55,6 +55,8 @@ class SolidTSDF(Mesher):
         """See `Mesher.mesh`."""
         if not are_solids(subject):
             emit(Warned(f"mesh:gggs-tsdf: {subject.splats.kind} splats are no solids; their median depth is fused"))
+            return self.fusion.mesh(subject)
+        if subject.splats.geometry == "solid":  # the median depth that is drawn is this one
             return self.fusion.mesh(subject)
         solids = replace(subject.splats, geometry="solid", antialias=False)
         pixels = {"drawn": 0, "found": 0}
