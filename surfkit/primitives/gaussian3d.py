@@ -17,6 +17,11 @@ from surfkit.primitives.smoothing import Smoothable
 from surfkit.raster.api import ALONG_RAYS, DILATION, Splats
 from surfkit.scene.scene import SparsePoints
 
+NO_NORMALS = (
+    "primitive.first_thickness: the start knows no normals, so splats begin as balls; choose start:stereo, which knows "
+    "them, or leave the option out"
+)
+
 
 @dataclass(frozen=True)
 class Gaussian3D(Smoothable, Primitive):
@@ -62,12 +67,7 @@ class Gaussian3D(Smoothable, Primitive):
         params = seeds(columns, cloud)
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
         if self.first_thickness < 1 and cloud.normals is None:
-            emit(
-                Warned(
-                    "primitive.first_thickness: the start knows no normals, so splats begin as balls; start:stereo knows "
-                    "them, or leave the option out"
-                )
-            )
+            emit(Warned(NO_NORMALS))
         elif self.first_thickness < 1 and cloud.normals is not None:
             quats, raw = facing(cloud.normals), params["scales"]
             thin = columns["scales"].activation.times(raw[:, 2:], self.first_thickness)
