@@ -193,6 +193,8 @@ def _other_rows(found: ResourceEstimate) -> list[tuple[str, str]]:
     """Of depth maps before the first step, and the mesh after the last, if they are made."""
     maps = f"{duration(found.depth_seconds)} before, for depth maps, unless an earlier run has made them"
     table = [("", maps)] if found.depth_seconds else []
+    if found.refine_seconds:
+        table.append(("", f"{duration(found.refine_seconds)} after, to refine it, at the speed of the last steps"))
     if (mesh := found.mesh) is not None:
         memory = f"{size(mesh.memory_bytes)} of memory beside the points"
         table.append(("", f"{duration(mesh.seconds)} after, for the mesh, with {memory}"))

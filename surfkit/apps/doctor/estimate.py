@@ -130,6 +130,7 @@ class ResourceEstimate:
         mesh: What making the mesh takes after it, not among `seconds`; None where none is made, or a few photographs do
             not tell.
         first: Points at the beginning.
+        refine_seconds: Of what the recipe refines after it, not among `seconds`; 0 where nothing is refined.
     """
 
     points: int
@@ -148,6 +149,13 @@ class ResourceEstimate:
     depth_seconds: float = 0.0
     mesh: MeshCosts | None = None
     first: int = 0
+    refine_seconds: float = 0.0
+
+    @property
+    def whole_seconds(self) -> float:
+        """From the depth maps to the mesh, as far as they are foretold."""
+        mesh = 0.0 if self.mesh is None else self.mesh.seconds
+        return self.depth_seconds + self.seconds + self.refine_seconds + mesh
 
 
 def estimate(
@@ -227,7 +235,7 @@ def advice(found: ResourceEstimate) -> list[Finding]:
 
 def first_look(found: ResourceEstimate) -> list[Finding]:
     """The recipe for a first look, where one that begins at stereo depth takes hours."""
-    if (seconds := found.seconds + found.depth_seconds) <= FIRST_LOOK_S:
+    if (seconds := found.whole_seconds) <= FIRST_LOOK_S:
         return []
     text = f"the run will take about {duration(seconds)}; recipe:surface-short --steps 500 is a first look"
     return [Finding("note", "first-look", text)]
@@ -303,11 +311,11 @@ def _disk(found: ResourceEstimate) -> list[Finding]:
 
 
 def _time(found: ResourceEstimate) -> list[Finding]:
-    if found.seconds <= LONG_RUN_S:
+    if found.whole_seconds <= LONG_RUN_S:
         return []
     text = (
-        f"the run will take about {duration(found.seconds)}: --steps shortens it with every schedule scaled along, and "
-        "--scale 2 makes each step about four times faster"
+        f"the run will take about {duration(found.whole_seconds)}: --steps shortens it with every schedule scaled "
+        "along, and --scale 2 makes each step about four times faster"
     )
     return [Finding("warning", "time", text)]
 

@@ -67,11 +67,13 @@ class Foretold:
         depth_seconds: Of the depth maps of all photographs; 0 where none are made, or it cannot be told.
         points: At the start; None where it cannot be told, or needs no depth maps.
         mesh: None where none is made, or it cannot be told.
+        refine_depth_seconds: Of the depth maps that refinements make, as if they began at no known depth.
     """
 
     depth_seconds: float = 0.0
     points: int | None = None
     mesh: MeshCosts | None = None
+    refine_depth_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,14 @@ def foretell(data: Data, examined: ExaminedData, recipe: Recipe, device: Device,
                 found = replace(found, points=min(count, recipe.start.most_points or count))
             if recipe.mesh is not None:
                 found = replace(found, mesh=mesh_costs(run, model, few, recipe.mesh, device))
+        again = {}  # by estimator: several refinements make maps the same way
+        for estimator in (refine.estimator for refine in recipe.refine):
+            if estimator is None:
+                continue
+            if estimator not in again:
+                again[estimator] = _depth_seconds(data, estimator, few, device, folder / f"again{len(again)}")
+            seconds = found.refine_depth_seconds + again[estimator]
+            found = replace(found, refine_depth_seconds=seconds)
     return found
 
 

@@ -103,8 +103,14 @@ def forecast(
     if probed.failure is not None or probed.written is None:
         return None, [_failed(probed, held_back)]
     found = estimate(load, parts, rising, probed, room)
+    steps = sum(refine.stage.steps for refine in recipe.refine)
     found = replace(
-        found, probe_seconds=time.perf_counter() - begun, depth_seconds=few.depth_seconds, mesh=few.mesh, first=first
+        found,
+        probe_seconds=time.perf_counter() - begun,
+        depth_seconds=few.depth_seconds,
+        mesh=few.mesh,
+        first=first,
+        refine_seconds=few.refine_depth_seconds + steps * found.step_seconds[-1],
     )
     look = first_look(found) if recipe.start.is_dense and recipe.start.needs_prior else []
     return found, [*beyond(recipe, few), *advice(found), *look]
@@ -113,10 +119,11 @@ def forecast(
 def beyond(recipe: Recipe, few: Foretold) -> list[Finding]:
     """What of the run the forecast leaves out."""
     later = ["the blocks, which are foretold when they are planned"] if recipe.partition is not None else []
-    later += ["what the recipe refines"] if recipe.refine else []
     later += (
         ["making depth maps, where the data set has none"] if recipe.depth is not None and not few.depth_seconds else []
     )
+    again = any(refine.estimator is not None for refine in recipe.refine) and not few.refine_depth_seconds
+    later += ["making depth maps from what the model draws"] if again else []
     later += ["making the mesh"] if recipe.mesh is not None and few.mesh is None else []
     text = f"memory, disk and time are those of pretraining alone; the run needs more for: {'; '.join(later)}"
     return [Finding("note", "forecast", text)] if later else []

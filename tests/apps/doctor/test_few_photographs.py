@@ -25,6 +25,7 @@ from surfkit.runs.pipeline import Intervals, run
 from surfkit.runs.recipe import with_steps
 from surfkit.start.stereo_start import StereoStart
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train.refine.rendered_depth import RenderedDepth
 
 FLIGHTS = {
     "nadir": Flight(kind="grid", views=30, width=120, height=90, points=2_000, test_every=0),
@@ -91,6 +92,16 @@ def test_filled_maps_are_foretold_by_their_own_size(tmp_path, monkeypatch):
     monkeypatch.setattr(Filled, "estimate", lambda own, *given: own.stereo.estimate(*given))
     filled = replace(half, depth=Filled(stereo=PatchMatch(scale=4)))
     assert told(data, filled, tmp_path / "filled").depth_seconds == pytest.approx(each[1])
+
+
+def test_maps_that_refinements_make_are_foretold(tmp_path, monkeypatch):
+    data, clock = scene(tmp_path, FLIGHTS["orbit"], monkeypatch)
+    coarse, fine = (RenderedDepth(depth=PatchMatch(scale=scale)) for scale in (4, 2))
+    none = replace(recipes()["2dgs"], mesh=None)
+    assert told(data, none, tmp_path / "none").refine_depth_seconds == 0 and not clock.sizes
+    found = told(data, replace(none, refine=(coarse, fine, coarse)), tmp_path / "three")
+    assert found.refine_depth_seconds == pytest.approx(20 * 120 * 90 / 100 * (1 / 16 + 1 / 4 + 1 / 16), rel=0.1)
+    assert found.depth_seconds == 0 and len(clock.sizes) == 2 * 12, "each kind of map once"
 
 
 CLOCK = SimpleNamespace(now=0.0)

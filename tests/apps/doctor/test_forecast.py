@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from surfkit.apps.doctor.command import rows
 from surfkit.apps.doctor.estimate import (
     FixedCosts,
     MachineLimits,
@@ -55,6 +56,7 @@ from surfkit.scene.scene import SparsePoints
 from surfkit.study.recipes.surface_recipes import SURFACE
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train.refine.rendered_depth import RenderedDepth
 from surfkit.train.trainer import Trainer
 
 STARTED = ProbeStart(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
@@ -191,16 +193,28 @@ def test_what_comes_after_pretraining_is_named():
         [finding.text for finding in beyond(recipe, Foretold())]
         for recipe in map(recipes().get, ("2dgs", "citygs2", "citygs"))
     ]
-    assert (
-        found[0][0].endswith("the run needs more for: making the mesh")
-        and "the blocks" in found[1][0]
-        and "refines" not in found[1][0]
-    )
-    assert "the blocks" in found[2][0] and "refines" in found[2][0]
+    assert found[0][0].endswith("the run needs more for: making the mesh") and "the blocks" in found[1][0]
+    assert "the blocks" in found[2][0] and "what the model draws" not in found[2][0]
+    refined = replace(recipes()["2dgs"], refine=(RenderedDepth(),))
+    assert "depth maps from what the model draws" in beyond(refined, Foretold())[0].text
+    assert "draws" not in beyond(refined, Foretold(refine_depth_seconds=1.0))[0].text
     assert beyond(replace(recipes()["2dgs"], mesh=None), Foretold()) == []
     assert beyond(recipes()["2dgs"], Foretold(mesh=MeshCosts(1.0, 1))) == []
     assert "depth maps" in beyond(recipes()["surface"], Foretold())[0].text
     assert "depth maps" not in beyond(recipes()["surface"], Foretold(depth_seconds=1.0))[0].text
+
+
+def test_refinements_are_foretold_at_the_speed_of_the_last_steps(farm, monkeypatch):
+    whole = probed((1_000_000,) * 5, (1.0,) * 5, (3_000_000_000,) * 5)
+    monkeypatch.setattr("surfkit.apps.doctor.forecast.probe", lambda job, told: whole)
+    data, recipe = Data(farm, test_every=0), replace(recipes()["2dgs"], mesh=None)
+    stages = tuple(RenderedDepth(stage=replace(RenderedDepth().stage, steps=steps)) for steps in (700, 50))
+    for refine, seconds in ((), 0.0), (stages, 750.0):
+        refined = replace(recipe, refine=refine)
+        found, _ = forecast(data, refined, examine(data, refined, quick=True), ProbePlan())
+        assert found.refine_seconds == pytest.approx(seconds * found.step_seconds[-1]) and found.step_seconds[-1] > 0
+        assert found.whole_seconds == pytest.approx(found.seconds + found.refine_seconds)
+    assert any("after, to refine it" in text for _, text in rows(found))
 
 
 def test_points_become_as_many_as_wanted(farm):
