@@ -124,7 +124,7 @@ def run(
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
-        shares = RunCache.of(run, store, backend, prints)
+        shares = RunCache.of(run, store, backend, prints, scene.train)
         ctx = RunContext(run, scene, rasterizer, intervals, caches, shares)
         refuse_unrefinable(ctx)
         stages = RecipeStages(ctx, compute, meter, state)

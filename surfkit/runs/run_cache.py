@@ -6,15 +6,19 @@ import hashlib
 import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import MemoryTaken, emit, say
 from surfkit.core.registry import BUILTIN, plugins, records
+from surfkit.depth.base import DepthEstimator
+from surfkit.depth.prepare_depth_maps import files_of
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.fingerprint import FileStamp, Fingerprint
 from surfkit.runs import journal
@@ -23,6 +27,7 @@ from surfkit.runs.folder import SHARED, Run
 from surfkit.runs.recipe import Recipe, complete
 from surfkit.runs.run_notes import prefix_notes, repeat_warnings
 from surfkit.runs.stage_cache import CachedStage, StageCache
+from surfkit.scene.scene import View
 from surfkit.train.data_cache import needs_priors
 
 PART_FILE_PATTERNS = {
@@ -61,13 +66,15 @@ class SharedPart:
             on; "result" of a method without stages; "mesh", "lod" and "compress".
         after: The part that it is made from, if any.
         settings: Plain data: the settings that belong to it.
-        needs_prior: Whether it looks at depth maps.
+        needs_prior: Whether it looks at depth maps of the run.
+        estimator: What makes it depth maps of its own.
     """
 
     name: str
     after: str | None
     settings: Any
     needs_prior: bool = False
+    estimator: DepthEstimator | None = None
 
 
 def parts(recipe: Recipe) -> Iterator[SharedPart]:
@@ -92,7 +99,7 @@ def parts(recipe: Recipe) -> Iterator[SharedPart]:
         own = refine.estimator
         needs_prior = (own is None and needs_priors(refine.stage.losses)) or any(m.needs_prior for m in refine.meshers)
         settings = dump(refine) if own is None else [dump(refine), own.version]
-        yield SharedPart(f"refine{at}", last, settings, needs_prior)
+        yield SharedPart(f"refine{at}", last, settings, needs_prior, own)
         last = f"refine{at}"
     if recipe.mesh is not None:
         yield SharedPart("mesh", last, dump(recipe.mesh), recipe.mesh.needs_prior)
@@ -105,18 +112,17 @@ def _settings(recipe: Recipe, names: Sequence[str]) -> dict[str, Any]:
     return {name: dump(getattr(recipe, name)) for name in names}
 
 
-def part_keys(recipe: Recipe, inputs: Callable[[bool], Any] = lambda needs_prior: None) -> dict[str, str]:
+def part_keys(recipe: Recipe, inputs: Callable[[SharedPart], Any] = lambda part: None) -> dict[str, str]:
     """By the name of each part, the hash of all that determines it: its settings, its inputs, the parts before.
 
     Args:
         recipe: The recipe.
-        inputs: Plain data on what a part reads, for parts that look at depth maps and for others; without it, keys tell
-            apart what is made from the same data.
+        inputs: Plain data on what a part reads; without it, keys tell apart what is made from the same data.
     """
     found: dict[str, str] = {}
     for part in parts(recipe):
         depth = dump(recipe.depth) if part.needs_prior else None
-        known = [found.get(part.after or ""), part.name, part.settings, depth, inputs(part.needs_prior)]
+        known = [found.get(part.after or ""), part.name, part.settings, depth, inputs(part)]
         found[part.name] = hashlib.sha256(json.dumps(known).encode()).hexdigest()[:32]
     return found
 
@@ -167,17 +173,18 @@ def _source_tag(name: str) -> str:
     return f"+{found.hexdigest()[:12]}"
 
 
-def inputs_of(run: Run, backend: str, prints: Fingerprint) -> Callable[[bool], Any]:
+def inputs_of(run: Run, backend: str, prints: Fingerprint, views: Sequence[View] = ()) -> Callable[[SharedPart], Any]:
     """What the parts of a run read, as `part_keys` wants it.
 
     Args:
         run: With the depth maps that were found or made.
         backend: Name of the rasterizer.
         prints: Of the data.
+        views: Of the training photographs, of which files of depth maps are looked for.
     """
 
-    def inputs(needs_prior: bool) -> Any:
-        photographs = {}
+    def inputs(part: SharedPart) -> Any:
+        photographs, needs_prior = {}, part.needs_prior
         for name, known in prints.photographs.items():
             beside = {what: _content(known.beside[what]) for what in known.beside if what == "mask" or needs_prior}
             photographs[name] = [known.camera, known.size, known.content, known.held_out, beside]
@@ -189,9 +196,18 @@ def inputs_of(run: Run, backend: str, prints: Fingerprint) -> Callable[[bool], A
             "points": prints.points,
             "photographs": photographs,
             "files": {path: _content(stamp) for path, stamp in prints.files.items()},
+            "estimator_files": _files_read(part.estimator, views),
         }
 
     return inputs
+
+
+def _files_read(estimator: DepthEstimator | None, views: Sequence[View]) -> list[str]:
+    """What tells the files that an estimator reads from others; nothing where they are not there, which
+    `refuse_unrefinable` tells if they are needed."""
+    with suppress(BadInput):
+        return [] if estimator is None else files_of(estimator, views)
+    return []
 
 
 def _content(stamp: FileStamp) -> list[Any]:
@@ -215,11 +231,13 @@ class RunCache:
     found: dict[str, CachedStage] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, run: Run, store: StageCache | None, backend: str, prints: Fingerprint) -> RunCache:
+    def of(
+        cls, run: Run, store: StageCache | None, backend: str, prints: Fingerprint, views: Sequence[View]
+    ) -> RunCache:
         """Look for the parts of a run in a store; nothing is written."""
         if store is None:
             return cls(run)
-        keys, known, found = part_keys(run.recipe, inputs_of(run, backend, prints)), read_shared(run.out), {}
+        keys, known, found = part_keys(run.recipe, inputs_of(run, backend, prints, views)), read_shared(run.out), {}
         for part in parts(run.recipe):
             has_before = part.after is None or part.after in found or _is_there(run.out, part.after, keys, known)
             if not has_before or _is_there(run.out, part.name, keys, known):

@@ -124,7 +124,7 @@ def foretell(data: Data, examined: ExaminedData, recipe: Recipe, device: Device,
                 found = replace(found, points=min(count, recipe.start.most_points or count))
             if recipe.mesh is not None:
                 found = replace(found, mesh=mesh_costs(run, model, few, recipe.mesh, device))
-        again = {}  # by estimator: several refinements make maps the same way
+        again: dict[DepthEstimator, float] = {}  # by estimator: several refinements make maps the same way
         for estimator in (refine.estimator for refine in recipe.refine):
             if estimator is None:
                 continue

@@ -1,8 +1,10 @@
 """Training that goes on with depth maps which begin at what the model draws."""
 
 import json
+import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from needs import needs_native
@@ -16,7 +18,8 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.io.datasets.data import Data
 from surfkit.io.datasets.depth_map_index import read_made
-from surfkit.io.datasets.fingerprint import digest
+from surfkit.io.datasets.fingerprint import digest, fingerprint
+from surfkit.io.datasets.read import read
 from surfkit.losses.depth import DepthRegression
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.raster.select import select
@@ -25,7 +28,7 @@ from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
 from surfkit.runs.pipeline import load_run, run
 from surfkit.runs.recipe import Recipe
-from surfkit.runs.run_cache import part_keys
+from surfkit.runs.run_cache import inputs_of, part_keys
 from surfkit.runs.run_stage import Intervals, drawing
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -225,6 +228,27 @@ def test_the_maps_of_a_run_are_another_thing(farm, recipe, tmp_path):
         )
     ]
     assert keys[0] == keys[1] != keys[2]
+
+
+def test_other_files_of_its_estimator_make_another_stage(farm, recipe, tmp_path):
+    """Maps of a network that were made again in the same folder must not be taken for those of before."""
+    scene, maps = read(farm), tmp_path / "estimated_depths"
+    prints = fingerprint(scene)
+    maps.mkdir()
+    for view in scene.train:
+        np.save(maps / f"{view.name}.npy", np.ones((4, 4), np.float32))
+    refine = replace(REFINED, depth=Filled(stereo=QUICK, fill=MonocularFill(maps=str(tmp_path))))
+
+    def keys(refine=refine):
+        made = Run(tmp_path / "run", replace(recipe, refine=(refine,)), farm)
+        return part_keys(made.recipe, inputs_of(made, "cpu", prints, scene.train))
+
+    first = keys()
+    assert keys() == first
+    np.save(maps / f"{scene.train[1].name}.npy", np.ones((5, 4), np.float32))
+    assert keys()["refine0"] != first["refine0"] and keys()["pretrain"] == first["pretrain"]
+    shutil.rmtree(maps)
+    assert keys()["refine0"] != first["refine0"], "which are not there is told later, if they are needed"
 
 
 def test_a_model_that_differs_anywhere_has_maps_of_its_own():
