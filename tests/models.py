@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from surfkit.io.splats.ply import write_splats
@@ -42,3 +43,10 @@ def like_3dgs(path, scene, degree=3, **changes):
     kept = b"".join(line for line in head.splitlines(keepends=True) if not line.startswith(b"comment"))
     path.write_bytes(kept + end + body)
     return path
+
+
+def with_column(path, name, values):
+    """Give a PLY file of splats, all float32, one more property behind the others."""
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(len(values), -1)
+    path.write_bytes(head + f"property float {name}\n".encode() + end + np.c_[rows, values].astype("<f4").tobytes())

@@ -15,6 +15,7 @@ from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
+from surfkit.primitives.model import DrawnAs
 from surfkit.raster.select import Device
 from surfkit.runs.blocks.train_blocks import Compute
 from surfkit.runs.folder import Run
@@ -47,6 +48,11 @@ class ImportCommand:
     """Axes of the numbers in the file, as SPZ names them: rdf for right, down, forward, those of a PLY file, which are
     taken as they are. auto: those that the file or its format names, else those that fit the photographs best."""
 
+    drawn_as: DrawnAs = "auto"
+    """How the program that trained ellipsoids draws them. 3dgs: with the blur of 3DGS; antialias: with it made up for,
+    as gsplat does in its mode antialiased; mip-splatting: likewise with its smaller blur; gof: along rays without blur
+    (Gaussian Opacity Fields). auto: as the file says, and as 3DGS where it says nothing."""
+
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = field(default_factory=TSDF)
     """How the splats become triangles; none for no mesh."""
 
@@ -64,7 +70,7 @@ class ImportCommand:
         existing_model(self.file, "FILE")
         data = self.reading.of(self.data)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.file.resolve().stem}"
-        recipe = replace(IMPORTED, method=SplatImport(self.file, self.axes), mesh=self.mesh)
+        recipe = replace(IMPORTED, method=SplatImport(self.file, self.axes, self.drawn_as), mesh=self.mesh)
         metrics = run(recipe, data, out, Compute(self.device), caches=CacheSettings(self.cache))
         show(Run(out, recipe, data), metrics)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -48,8 +49,26 @@ class SplatModel:
         return replace(self, params={n: v if n in shared else v[rows] for n, v in self.params.items()})
 
 
-def primitive_of(table: SplatTable) -> Primitive:
-    """What the splats of a file are."""
+DrawnAs = Literal["auto", "3dgs", "antialias", "mip-splatting", "gof"]
+"""How ellipsoids of other programs are drawn, which few files say: with the blur of 3DGS; with it made up for, as
+gsplat can; likewise with the smaller blur of Mip-Splatting; along rays, as Gaussian Opacity Fields does."""
+FORMS: dict[DrawnAs, dict[str, Any]] = {
+    "3dgs": {},
+    "antialias": {"antialias": True},
+    "mip-splatting": {"antialias": True, "dilation": 0.1},
+    "gof": {"geometry": "ray"},
+}
+"""Fields of `Gaussian3D` by how its splats are drawn."""
+
+
+def primitive_of(table: SplatTable, drawn_as: DrawnAs = "auto") -> Primitive:
+    """What the splats of a file are.
+
+    Args:
+        table: The splats.
+        drawn_as: How ellipsoids are drawn; auto for what the file says, and as 3DGS where it says nothing.
+    """
     if table.kind == "surfel":
         return Surfel2D(sh_degree=table.sh_degree)
-    return Gaussian3D(sh_degree=table.sh_degree, antialias=table.antialias)
+    form = {"antialias": table.antialias} if drawn_as == "auto" else FORMS[drawn_as]
+    return Gaussian3D(sh_degree=table.sh_degree, **form)

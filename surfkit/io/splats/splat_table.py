@@ -48,6 +48,8 @@ class SplatTable:
         sh_rest: (N, K - 1, 3) coefficients of degrees 1 to 3, K in {1, 4, 9, 16}.
         antialias: Gaussians only: to be drawn dimmed by what the blur of the rasterizer adds to them (Mip-Splatting).
         axes: Of the numbers in the file that the splats were read from; the reader has turned them to PLY_AXES.
+        is_filtered: Whether a filter of the file was applied to them (Mip-Splatting, Gaussian Opacity Fields) that does
+            not say how they are to be drawn.
     """
 
     kind: Kind
@@ -59,6 +61,7 @@ class SplatTable:
     sh_rest: Tensor
     antialias: bool = False
     axes: FileAxes = FileAxes(PLY_AXES)
+    is_filtered: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):

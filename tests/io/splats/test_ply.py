@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from models import with_column
 from needs import needs
 
 from surfkit.core.check import BadInput
@@ -51,13 +52,6 @@ def test_there_and_back(tmp_path, kind, degree):
         assert torch.equal(getattr(after, name), getattr(before, name)), name
 
 
-def with_column(path, name, values):
-    """A file of `write_splats` with one more property behind the others."""
-    head, end, body = path.read_bytes().partition(b"end_header\n")
-    rows = np.frombuffer(body, "<f4").reshape(len(values), -1)
-    path.write_bytes(head + f"property float {name}\n".encode() + end + np.c_[rows, values].astype("<f4").tobytes())
-
-
 @pytest.mark.parametrize("deviations", [np.linspace(0.01, 3, 50), np.full(50, 1e3), np.zeros(50)])
 def test_the_filter_of_mip_splatting_is_applied(tmp_path, deviations):
     """The covariance grows by deviation^2 times the identity, the opacity falls by the root of the determinants."""
@@ -65,6 +59,7 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, deviations):
     write_splats(tmp_path / "a.ply", splats)
     with_column(tmp_path / "a.ply", "filter_3D", deviations)
     found = read_splats(tmp_path / "a.ply")
+    assert not found.is_filtered, "surfkit wrote how it is drawn"
     variances = np.exp(2 * splats.log_scales.double().numpy())
     wider = variances + np.float32(deviations)[:, None].astype(float) ** 2
     np.testing.assert_allclose(np.exp(found.log_scales.double().numpy()), np.sqrt(wider), rtol=1e-6)

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from models import ORIGIN, data_set, like_3dgs
+from listening import listening
+from models import ORIGIN, data_set, like_3dgs, with_column
 from PIL import Image
 
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
 from surfkit.core.registry import components
 from surfkit.core.tree import evolve
 from surfkit.io.datasets.data import Data
@@ -20,6 +22,7 @@ from surfkit.io.datasets.read import read
 from surfkit.io.splats.base import Format
 from surfkit.io.splats.ply import read_splats, write_splats
 from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.primitives.model import FORMS
 from surfkit.runs.methods.imported import SplatImport
 from surfkit.runs.pipeline import loaded, run
 from surfkit.runs.recipe import Recipe, with_steps
@@ -119,6 +122,37 @@ def test_antialias_is_kept(data, tmp_path):
     imported(path, data, tmp_path / "out")
     with loaded(tmp_path / "out", "cpu") as (_, made):
         assert made.splats.primitive.antialias
+
+
+@pytest.mark.parametrize("drawn_as", FORMS)
+def test_ellipsoids_are_drawn_as_the_program_that_trained_them(data, tmp_path, drawn_as):
+    """A run that draws so, written to a file that does not say how, has the figures of that run again."""
+    source = replace(with_steps(recipes()["3dgs"], 20), mesh=None, primitive=Gaussian3D(**FORMS[drawn_as]))
+    metrics = run(source, data, tmp_path / "source")
+    path = tmp_path / "a.ply"
+    write_splats(path, replace(read_splats(tmp_path / "source" / "point_cloud.ply"), antialias=False))
+    found = {
+        name: run(Recipe(method=SplatImport(path, drawn_as=name)), data, tmp_path / name)["images"]["psnr"]
+        for name in (drawn_as, "auto")
+    }
+    assert found[drawn_as] == pytest.approx(metrics["images"]["psnr"], abs=0.01)
+    assert (found["auto"] == found[drawn_as]) == (drawn_as == "3dgs")
+
+
+def test_a_filter_without_a_word_on_the_drawing_is_told(data, tmp_path):
+    """As Mip-Splatting and Gaussian Opacity Fields write."""
+    path = like_3dgs(tmp_path / "a.ply", read(data))
+    with_column(path, "filter_3D", np.full(len(read_splats(path)), 0.01))
+    for drawn_as, count in (("auto", 1), ("gof", 0)):
+        with listening(Warned, lambda event: event.text) as notes:
+            run(Recipe(method=SplatImport(path, drawn_as=drawn_as)), data, tmp_path / drawn_as)
+        assert sum("filter_3D" in note for note in notes) == count
+
+
+def test_discs_are_drawn_as_discs(data, trained, tmp_path):
+    with pytest.raises(BadInput, match="are discs, and drawn-as gof"):
+        run(Recipe(method=SplatImport(trained[0] / "point_cloud.ply", drawn_as="gof")), data, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("named", [True, False])
