@@ -23,6 +23,7 @@ COLUMN_NAMES = {
     "y": "y ylatitude ynorth ynorthing northing north n latitude lat gpslatitude geoy",
     "z": "z zaltitude zheight altitude alt height elevation elev h up gpsaltitude ellipsoidalheight geoz",
     "crs": "crs epsg srs coordinatesystem projection",
+    "enabled": "enable enabled",
     "sx": "sx sigmax stdx sde sdeast stdeast xaccuracy accuracyx xacc sdlon stdlon",
     "sy": "sy sigmay stdy sdn sdnorth stdnorth yaccuracy accuracyy yacc sdlat stdlat",
     "sxy": "sxy sigmaxy accuracyhorz horzaccuracy horizontalaccuracy accuracyhorizontal hacc xyaccuracy accuracyxy "
@@ -34,7 +35,9 @@ COLUMN_NAMES = {
 MEANINGS = {name: column for column, names in COLUMN_NAMES.items() for name in names.split()}
 GEO_TXT_COLUMNS = ("name", "x", "y", "z", "yaw", "pitch", "roll", "sxy", "sz")
 """Columns of geo.txt, and of a table without a header."""
-DEGREE_NAMES = {"longitude", "lon", "long", "lng", "gpslongitude"}
+SWITCHES = {**dict.fromkeys(("1", "true", "yes", ""), True), **dict.fromkeys(("0", "false", "no"), False)}
+"""Whether a position is to be used, by what the column of Metashape that says so has, in small letters."""
+DEGREE_NAMES = {"longitude", "xlongitude", "lon", "long", "lng", "gpslongitude"}
 """Names of x that say degrees."""
 UNIT_METRES = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
@@ -71,12 +74,12 @@ class Listed:
     """Positions that a file gives.
 
     Attributes:
-        positions: By the name of the photograph, as the file has it.
+        positions: By the name of the photograph, as the file has it; None where it is disabled there.
         accuracies: Standard deviations east, north and up, metres, of those for which it gives them.
         systems: Of its coordinates.
     """
 
-    positions: Mapping[str, Position]
+    positions: Mapping[str, Position | None]
     accuracies: Mapping[str, tuple[float, float, float]]
     systems: Sequence[System]
 
@@ -145,7 +148,7 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
     }
     if accuracies and not table.metres.keys() & set(ACCURACY_COLUMNS):
         _tell_unit_of_accuracies(systems.values(), said)
-    return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
+    return Listed({**dict.fromkeys(table.disabled), **positions}, accuracies, list(dict.fromkeys(systems.values())))
 
 
 def _tell_unit(systems: Iterable[System], said: str) -> None:
@@ -190,12 +193,14 @@ class PositionTable:
         rows: One for each photograph with a position.
         degrees: Whether names of columns say degrees.
         metres: Metres per unit of heights and accuracies, by column, where its name states a unit.
+        disabled: Names of photographs whose position is not to be used.
     """
 
     system: str | None
     rows: Sequence[PositionRow]
     degrees: bool
     metres: Mapping[str, float]
+    disabled: Sequence[str]
 
 
 def _table(lines: Sequence[str], said: str) -> PositionTable:
@@ -203,6 +208,7 @@ def _table(lines: Sequence[str], said: str) -> PositionTable:
     system, header, degrees = None, None, False
     metres: dict[str, float] = {}
     rows: list[PositionRow] = []
+    disabled: list[str] = []
     for at, line in enumerate(lines, 1):
         text = line.strip()
         comment = COMMENT.fullmatch(text)
@@ -232,8 +238,23 @@ def _table(lines: Sequence[str], said: str) -> PositionTable:
             continue  # a photograph without a position, as Metashape lists them
         if not row.cells.get("name"):
             raise BadInput(f"{said}: line {at} is {text[:60]!r}, not {WANTED}")
-        rows.append(row)
-    return PositionTable(system, rows, degrees, metres)
+        if _is_enabled(row, said):
+            rows.append(row)
+        else:
+            disabled.append(row.cells["name"])
+    if disabled and not rows:
+        raise BadInput(f"{said}: its column of enabled positions has all of them disabled; enable those to be used")
+    if disabled:
+        emit(Warned(f"{said}: positions of {len(disabled)} photographs are disabled, and not used: {few(disabled)}"))
+    return PositionTable(system, rows, degrees, metres, disabled)
+
+
+def _is_enabled(row: PositionRow, said: str) -> bool:
+    """Whether the position is to be used, as far as a column says so."""
+    text = row.cells.get("enabled", "")
+    if text.lower() not in SWITCHES:
+        raise BadInput(f"{said}: line {row.at} has {text[:20]!r} for whether it is enabled; write 1 or 0")
+    return SWITCHES[text.lower()]
 
 
 def _plain(cells: Sequence[str]) -> list[str]:

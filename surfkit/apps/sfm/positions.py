@@ -102,12 +102,13 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
         if not found.positions:
             emit(Warned(f"{said} names none of the photographs and is not used"))
             return list(photos), None
+    given = [name for name, position in found.positions.items() if position is not None]
     own = sum(photo.name in found.positions and photo.exif.position is not None for photo in photos)
     others = [photo.name for photo in photos if photo.name not in found.positions]
     rest = f"; {len(others)} are not in it, and keep the position in EXIF if they have one" if others else ""
     rest += f": {few(others)}" if others else ""
     instead = f", instead of those in EXIF of {own}" if own else ""
-    emit(Warned(f"{said} gives the positions of {len(found.positions)} photographs in {found.named}{instead}{rest}"))
+    emit(Warned(f"{said} gives the positions of {len(given)} photographs in {found.named}{instead}{rest}"))
     if settings.crs == "auto" and (lost := next(filter(None, (each.lost_heights for each in found.systems)), "")):
         emit(Warned(f"{said}: {lost}"))
     listed = [_listed(photo, found) for photo in photos]
@@ -128,13 +129,15 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
 
 
 def _listed(photo: Photo, found: Listed) -> Photo:
-    position = found.positions.get(photo.name)
-    if position is None:
+    """The photograph with its position in the list, or with none where the list has it disabled."""
+    if photo.name not in found.positions:
         return photo
     plain = replace(
         photo.exif, unsigned=(), no_reference=False, zero=None, xmp_position=None, xmp_altitude=None, above_start=None
     )
-    return replace(photo, exif=replace(plain, position=position, accuracy_m=found.accuracies.get(photo.name)))
+    return replace(
+        photo, exif=replace(plain, position=found.positions[photo.name], accuracy_m=found.accuracies.get(photo.name))
+    )
 
 
 def _named(listed: Listed, photos: Sequence[Photo], said: str) -> Listed:

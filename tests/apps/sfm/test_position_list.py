@@ -83,6 +83,19 @@ def test_heights_are_in_the_unit_that_the_list_or_its_system_states(listed):
         assert found.positions["a.jpg"][2] == pytest.approx(500 * (1.0 if unit == "deg" else metres)), unit
 
 
+def test_positions_that_are_switched_off_are_told_and_not_used(listed):
+    """Metashape exports which positions are checked in its pane of references."""
+    head = "#Label,Enable,X/Longitude,Y/Latitude,Z/Altitude\n"
+    with collect_notes() as notes:
+        found = listed(f"{head}a.jpg,1,151.2,-33.9,120.5\nb.jpg,0,3,4,5\nc.jpg,,151.2,-33.9,7\n")
+    assert found.positions["b.jpg"] is None and found.positions["c.jpg"] == pytest.approx((-33.9, 151.2, 7))
+    assert found.positions["a.jpg"] == pytest.approx(PLACE) and "1 photographs are disabled" in "".join(notes.texts)
+    with pytest.raises(BadInput, match="line 2 has 'maybe' for whether it is enabled; write 1 or 0"):
+        listed(f"{head}a.jpg,maybe,151.2,-33.9,120.5\n")
+    with pytest.raises(BadInput, match="all of them disabled"):
+        listed(f"{head}a.jpg,No,151.2,-33.9,120.5\n")
+
+
 def test_heights_that_are_missing_blanks_in_names_and_accuracies(listed):
     rows = ["DJI 0001.JPG", "b.jpg", "c.jpg", "d"]
     rows = [

@@ -131,6 +131,15 @@ def test_a_list_comes_first_then_geo_txt_then_exif(settled, tmp_path):
         assert at[1] == (*SOUTH[:2], 7.0) and ("heights are above EGM96 height" in said) == (crs == "auto")
 
 
+def test_a_position_that_a_list_has_disabled_is_not_that_of_exif_either(settled, tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("Label,Enable,Longitude,Latitude,Altitude\na,1,151.2,-33.9,7\nb,0,151.2,-33.9,8\n")
+    photos = [photo("a.jpg", SOUTH), photo("b.jpg", SOUTH, xmp_position=SOUTH), photo("c.jpg", SOUTH)]
+    _, at, said = settled(*photos, settings=Settings(positions=path))
+    assert at == [(*SOUTH[:2], 7.0), None, SOUTH] and "gives the positions of 1 photographs" in said
+    assert "not used: 'b'" in said and "1 are not in it" in said and "'c.jpg'" in said
+
+
 def test_geo_txt_in_the_folder_above_and_one_of_other_photographs(settled, tmp_path):
     (tmp_path / "geo.txt").write_text(GEO)
     found, at, _ = settled(photo(position=HERE, unsigned=BOTH))
