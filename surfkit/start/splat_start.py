@@ -12,12 +12,18 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model, model_file, read_sound, warn_of_no_fit
+from surfkit.io.splats.splat_files import untold_drawing
 from surfkit.io.splats.splat_table import SURFEL_SCALE_RATIO, SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
 from surfkit.scene.scene import Scene, SparsePoints
 from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.start.guess_axes import read_in_scene
+
+REMEDY = (
+    "--primitive.antialias --primitive.dilation 0.1 draws them as Mip-Splatting, and --primitive.geometry ray as "
+    "Gaussian Opacity Fields"
+)
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,9 @@ class SplatStart(Start):
         if splats.kind != table.kind or (flatter and not is_thin(table)):
             lost = " without their thinnest axis" if flatter else ""
             emit(Warned(f"{what} become {splats.kind}s{lost}, as the recipe has {name}; pictures will differ"))
+        elif table.is_filtered:
+            if not splats.antialias and splats.geometry == "axis":
+                emit(Warned(f"{untold_drawing(path)}; {REMEDY}"))
         elif splats.antialias != table.antialias:
             flag = "--primitive.antialias" if table.antialias else "--primitive.no-antialias"
             emit(Warned(f"{what} were trained {'with' if table.antialias else 'without'} antialias; add {flag}"))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from models import like_3dgs, with_column
 
 from surfkit.apps.export import ExportCommand, one_tile
 from surfkit.cli import main
@@ -15,6 +16,7 @@ from surfkit.io.splats.splat_files import format_of, read_splat_file
 from surfkit.io.splats.spz import SPZ
 from surfkit.scene.scene import Frame
 from surfkit.testing.format_checks import splat_table
+from surfkit.testing.inputs import start_input
 
 
 @pytest.fixture
@@ -141,3 +143,11 @@ def test_tiles_on_earth_leave_out_nothing(ply, tmp_path, capsys, monkeypatch):
     assert np.linalg.norm(move) == pytest.approx(40, abs=1e-3)
     status, lines, _ = said(capsys, ply, "format:tiles3d", "--format.no-georeference", "--out", tmp_path / "other")
     assert status == 0 and lines[1].startswith("coordinates leave out the offset 512000 5800000")
+
+
+def test_a_filter_without_a_word_on_the_drawing_is_told(tmp_path, capsys):
+    path = like_3dgs(tmp_path / "a.ply", start_input().scene)
+    with_column(path, "filter_3D", np.full(len(read_splats(path)), 0.01))
+    for at, axes in enumerate(("auto", "rdf")):
+        status, _, told = said(capsys, path, "--axes", axes, "--out", tmp_path / f"{at}.spz")
+        assert status == 0 and sum("taken as those of 3DGS" in line for line in told) == 1

@@ -3,12 +3,15 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from models import data_set, like_3dgs
+from listening import listening
+from models import data_set, like_3dgs, with_column
 
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
 from surfkit.core.schedule import LearningRate
 from surfkit.core.tree import evolve
 from surfkit.io.datasets.data import Data
@@ -152,6 +155,18 @@ def test_harmonics_that_are_cut_and_another_antialias_are_told(data, tmp_path):
     assert "cut to 1; --primitive.sh-degree 3" in notes(tmp_path / "out")
     assert "add --primitive.no-antialias" in notes(tmp_path / "out")
     assert load_run(tmp_path / "out")[1].sh_degree == 1
+
+
+def test_a_filter_without_a_word_on_the_drawing_is_told(data, tmp_path):
+    path = like_3dgs(tmp_path / "a.ply", read(data))
+    with_column(path, "filter_3D", np.full(len(read_splats(path)), 0.01))
+    scene = read(data)
+    others = Gaussian3D(antialias=True), Gaussian3D(geometry="ray")
+    for primitive, told in ((Gaussian3D(), True), *((each, False) for each in others)):
+        with listening(Warned, lambda event: event.text) as heard:
+            SplatStart(path).refuse_unfit(primitive, scene)
+        assert any("filter_3D is applied" in text and "--primitive.geometry ray" in text for text in heard) == told
+        assert not any("antialias; add" in text for text in heard), "nothing says with or without"
 
 
 def test_files_of_lower_degrees_learn_the_others(data, tmp_path):

@@ -28,6 +28,8 @@ def read_splat_file(path: Path, axes: AxesOrAuto = "auto", flag: str = "--axes r
         BadInput: No such file, of no known format, or damaged.
     """
     table = format_of(path).read(path)
+    if table.is_filtered:
+        emit(Warned(untold_drawing(path)))
     if axes != "auto":
         return from_axes(table, axes)
     if not table.axes.is_told and len(table):
@@ -38,6 +40,14 @@ def read_splat_file(path: Path, axes: AxesOrAuto = "auto", flag: str = "--axes r
 def untold_axes(path: Path) -> str:
     """How notes begin about a file whose axes are a guess."""
     return f"{path} does not say which axes its numbers have"
+
+
+def untold_drawing(path: Path) -> str:
+    """The note on a file of Mip-Splatting or Gaussian Opacity Fields, which draw otherwise than 3DGS."""
+    return (
+        f"{path}: its column filter_3D is applied; nothing says how its splats are drawn, so they are taken as those "
+        "of 3DGS"
+    )
 
 
 def assumed_axes(table: SplatTable) -> str:

@@ -10,14 +10,12 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.io.splats.file_axes import AxesOrAuto
 from surfkit.io.splats.models import existing_model, model_file, read_sound, warn_of_no_fit
+from surfkit.io.splats.splat_files import untold_drawing
 from surfkit.primitives.model import DrawnAs, SplatModel, primitive_of
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 from surfkit.start.guess_axes import read_in_scene
 
-UNTOLD_DRAWING = (
-    "its column filter_3D is applied; nothing says how its splats are drawn, so they are taken as those of 3DGS; "
-    "`surfkit import --drawn-as mip-splatting` draws them as Mip-Splatting, and gof as Gaussian Opacity Fields"
-)
+REMEDY = "`surfkit import --drawn-as mip-splatting` draws them as Mip-Splatting, and gof as Gaussian Opacity Fields"
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class SplatImport(Method):
         table = read_in_scene(path, given.scene, self.axes)
         warn_of_no_fit(path, table, given.scene)
         if table.is_filtered and self.drawn_as == "auto":
-            emit(Warned(f"{path}: {UNTOLD_DRAWING}"))
+            emit(Warned(f"{untold_drawing(path)}; {REMEDY}"))
         primitive = primitive_of(table, self.drawn_as)
         params = primitive.from_table(table, given.generator)
         return Reconstruction(
