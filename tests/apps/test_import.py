@@ -51,6 +51,7 @@ def test_a_file_becomes_a_run_folder(given, here, capsys):
         "use": "import",
         "file": str(here / "splats.ply"),
         "axes": "auto",
+        "drawn_as": "auto",
     }
     (here / "splats.ply").unlink()
     for words in (
