@@ -20,10 +20,11 @@ from surfkit.scene.scene import Scene, SparsePoints
 from surfkit.start.base import InitialModel, Start, StartInput
 from surfkit.start.guess_axes import read_in_scene
 
-REMEDY = (
+DRAWN_AS = (
     "--primitive.antialias --primitive.dilation 0.1 draws them as Mip-Splatting, and --primitive.geometry ray as "
     "Gaussian Opacity Fields"
 )
+"""What a user can do about splats of which no file says how they are drawn."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class SplatStart(Start):
             emit(Warned(f"{what} become {splats.kind}s{lost}, as the recipe has {name}; pictures will differ"))
         elif table.is_filtered:
             if not splats.antialias and splats.geometry == "axis":
-                emit(Warned(f"{untold_drawing(path)}; {REMEDY}"))
+                emit(Warned(untold_drawing(path, DRAWN_AS)))
         elif splats.antialias != table.antialias:
             flag = "--primitive.antialias" if table.antialias else "--primitive.no-antialias"
             emit(Warned(f"{what} were trained {'with' if table.antialias else 'without'} antialias; add {flag}"))

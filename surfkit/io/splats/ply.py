@@ -167,7 +167,7 @@ def read_splats(path: Path) -> SplatTable:
         sh0=gathered("f_dc_0", "f_dc_1", "f_dc_2"),
         sh_rest=gathered(*interleaved).reshape(len(rows), rest // 3, 3),
         antialias=mode == "mip",
-        is_filtered=SMOOTHED in names and not mode,
+        is_filtered=SMOOTHED in names and not mode and not surfel,
     )
 
 

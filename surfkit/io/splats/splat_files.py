@@ -14,6 +14,9 @@ from surfkit.io.splats.file_axes import Axes, AxesOrAuto, FileAxes, in_words, tu
 from surfkit.io.splats.rotate_splats import turned
 from surfkit.io.splats.splat_table import SplatTable
 
+DRAWN_AS = "`surfkit import --drawn-as mip-splatting` draws them as Mip-Splatting, and gof as Gaussian Opacity Fields"
+"""What a user can do about splats of which no file says how they are drawn."""
+
 
 def read_splat_file(path: Path, axes: AxesOrAuto = "auto", flag: str = "--axes rdf") -> SplatTable:
     """The splats of a file of any format, which its content tells, or its name where the content does not.
@@ -42,11 +45,16 @@ def untold_axes(path: Path) -> str:
     return f"{path} does not say which axes its numbers have"
 
 
-def untold_drawing(path: Path) -> str:
-    """The note on a file of Mip-Splatting or Gaussian Opacity Fields, which draw otherwise than 3DGS."""
+def untold_drawing(path: Path, remedy: str = DRAWN_AS) -> str:
+    """The note on a file of Mip-Splatting or Gaussian Opacity Fields, which draw otherwise than 3DGS.
+
+    Args:
+        path: Of the file.
+        remedy: What says how its splats are drawn.
+    """
     return (
         f"{path}: its column filter_3D is applied; nothing says how its splats are drawn, so they are taken as those "
-        "of 3DGS"
+        f"of 3DGS; {remedy}"
     )
 
 

@@ -15,8 +15,6 @@ from surfkit.primitives.model import DrawnAs, SplatModel, primitive_of
 from surfkit.runs.methods.base import Method, MethodInput, Reconstruction
 from surfkit.start.guess_axes import read_in_scene
 
-REMEDY = "`surfkit import --drawn-as mip-splatting` draws them as Mip-Splatting, and gof as Gaussian Opacity Fields"
-
 
 @dataclass(frozen=True)
 class SplatImport(Method):
@@ -63,7 +61,7 @@ class SplatImport(Method):
         table = read_in_scene(path, given.scene, self.axes)
         warn_of_no_fit(path, table, given.scene)
         if table.is_filtered and self.drawn_as == "auto":
-            emit(Warned(f"{untold_drawing(path)}; {REMEDY}"))
+            emit(Warned(untold_drawing(path)))
         primitive = primitive_of(table, self.drawn_as)
         params = primitive.from_table(table, given.generator)
         return Reconstruction(

@@ -60,6 +60,9 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, deviations):
     with_column(tmp_path / "a.ply", "filter_3D", deviations)
     found = read_splats(tmp_path / "a.ply")
     assert not found.is_filtered, "surfkit wrote how it is drawn"
+    head = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(head.replace(b"comment SplatRenderMode: default\n", b""))
+    assert read_splats(tmp_path / "a.ply").is_filtered
     variances = np.exp(2 * splats.log_scales.double().numpy())
     wider = variances + np.float32(deviations)[:, None].astype(float) ** 2
     np.testing.assert_allclose(np.exp(found.log_scales.double().numpy()), np.sqrt(wider), rtol=1e-6)
@@ -67,6 +70,15 @@ def test_the_filter_of_mip_splatting_is_applied(tmp_path, deviations):
     opacities = kept / (1 + np.exp(-splats.opacity_logits.double().numpy()))
     np.testing.assert_allclose(found.opacity_logits.double().sigmoid(), opacities, rtol=1e-5)
     assert torch.equal(found.means, splats.means) and torch.equal(found.sh_rest, splats.sh_rest)
+
+
+def test_discs_with_a_filter_are_drawn_as_discs(tmp_path):
+    write_splats(tmp_path / "a.ply", table("surfel"), strict_2dgs=True)
+    with_column(tmp_path / "a.ply", "filter_3D", np.ones(7))
+    body = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(body.replace(b"comment SplatRenderMode: 2dgs\n", b""))
+    found = read_splats(tmp_path / "a.ply")
+    assert found.kind == "surfel" and not found.is_filtered
 
 
 def test_columns_are_those_of_3dgs(tmp_path):
